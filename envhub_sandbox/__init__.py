@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from envhub_sandbox import errors as errors
+    from envhub_sandbox.extras.docker.sandbox import DockerSandbox as DockerSandbox
+    from envhub_sandbox.extras.fleet.fleet import Fleet as Fleet
+    from envhub_sandbox.extras.ray.sandbox import RaySandbox as RaySandbox
+    from envhub_sandbox.extras.remote.sandbox import RemoteSandbox as RemoteSandbox
     from envhub_sandbox.factory.make_env import make_env as make_env
     from envhub_sandbox.hub.reference import HubRef as HubRef
     from envhub_sandbox.integrations.gym import SandboxEnv as SandboxEnv
-    from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox as DockerSandbox
-    from envhub_sandbox.sandboxes.fleet.fleet import Fleet as Fleet
-    from envhub_sandbox.sandboxes.ray.sandbox import RaySandbox as RaySandbox
-    from envhub_sandbox.sandboxes.remote import RemoteSandbox as RemoteSandbox
     from envhub_sandbox.settings.policy import Limits as Limits
     from envhub_sandbox.settings.policy import Policy as Policy
     from envhub_sandbox.settings.policy import Timeouts as Timeouts
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     __version__: str
 
 _HOMES = {
-    "DockerSandbox": "sandboxes.docker.sandbox",
+    "DockerSandbox": "extras.docker.sandbox",
     "EnvSuites": "vector.suites",
-    "Fleet": "sandboxes.fleet.fleet",
+    "Fleet": "extras.fleet.fleet",
     "HubRef": "hub.reference",
     "Limits": "settings.policy",
     "Policy": "settings.policy",
-    "RaySandbox": "sandboxes.ray.sandbox",
-    "RemoteSandbox": "sandboxes.remote",
+    "RaySandbox": "extras.ray.sandbox",
+    "RemoteSandbox": "extras.remote.sandbox",
     "SandboxEnv": "integrations.gym",
     "SandboxVectorEnv": "vector.vector_env",
     "Timeouts": "settings.policy",

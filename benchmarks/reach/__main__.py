@@ -24,8 +24,9 @@ from typing import Any
 import uv
 
 from benchmarks.reach.play import STEPS
-from envhub_sandbox.dependencies import index, interpreters
-from envhub_sandbox.hub import registered
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.resolution import index
+from envhub_sandbox.extras.sources import registered
 from envhub_sandbox.system.folders import remove_tree
 
 HERE = Path(__file__).resolve().parent

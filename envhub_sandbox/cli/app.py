@@ -22,49 +22,49 @@ from envhub_sandbox.settings.options import OPTIONS, on_command_line, use_option
 from envhub_sandbox.system import extras
 
 Where = Mapping[str, str]
-"""The commands of a group: where the function of each is, below this package."""
+"""The commands of a group: where the function of each is, below ``envhub_sandbox``."""
 
 # each with the first line of its help, so that a list of them imports none
 _COMMANDS: dict[str, tuple[str, str | Where]] = {
     "run": (
         "Play episodes of an environment and print returns, lengths, speed and provenance.",
-        "run:run",
+        "cli.run:run",
     ),
     "inspect": (
         "Print suites, tasks, spaces, metadata and provenance, without stepping anything.",
-        "inspect:inspect",
+        "cli.inspect:inspect",
     ),
     "check": (
         "Run a repository in a sandbox and report what is wrong with it.",
-        "check.check:check",
+        "extras.judge.command.check:check",
     ),
     "diff": (
         "Compare two commits: files, packages, imports and findings; with --run, tasks and spaces.",
-        "diff:diff",
+        "extras.judge.command.diff:diff",
     ),
     "lock": (
         "Record commit, file hashes, packages, Python and spaces in a file for "
         "make_env(lock=FILE); with --check, compare a repository with one.",
-        "lock:lock",
+        "extras.packages.commands.lock:lock",
     ),
     "init": (
         "Write a new environment's repository: env.py, requirements, card, licence, test, CI "
         "workflow.",
-        "init:init",
+        "cli.init:init",
     ),
     "replay": (
         "Repeat the requests of a crash bundle, and report whether it dies in the same way.",
-        "replay:replay",
+        "extras.crash.command:replay",
     ),
     "doctor": (
         "Test what this host can enforce, and print what is missing and how to get it.",
-        "doctor:doctor",
+        "cli.doctor:doctor",
     ),
     "cache": (
         "List and remove snapshots, installed packages, and what killed clients left behind.",
-        {"list": "cache:list_", "remove": "cache:remove", "gc": "cache:gc"},
+        {"list": "cli.cache:list_", "remove": "cli.cache:remove", "gc": "cli.cache:gc"},
     ),
-    "image": ("Build container images for repositories.", {"build": "image:build"}),
+    "image": ("Build container images for repositories.", {"build": "extras.docker.command:build"}),
 }
 
 _FIRST = {"--n-envs", "--network", "--sandbox", "--task"}
@@ -187,7 +187,7 @@ def functions(name: str) -> dict[str, Callable[..., None]]:
     found = {}
     for one, place in ({name: where} if isinstance(where, str) else where).items():
         module, _, function = place.partition(":")
-        found[one] = extras.required(f"{__package__}.{module}", function, f"envhub {name}")
+        found[one] = extras.required(f"envhub_sandbox.{module}", function, f"envhub {name}")
     return found
 
 

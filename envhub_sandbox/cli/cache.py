@@ -20,8 +20,8 @@ from envhub_sandbox.hub.grammar import FOLDER
 from envhub_sandbox.system import extras
 from envhub_worker.protocol.text import counted, size_text
 
-_ENVIRONMENTS = "envhub_sandbox.dependencies.environments"
-_WHEELS = "envhub_sandbox.dependencies.builds.wheels"
+_ENVIRONMENTS = "envhub_sandbox.extras.packages.environments"
+_WHEELS = "envhub_sandbox.extras.packages.builds.wheels"
 _DAY_S = 24 * 3600.0
 _SHOWN = 18
 """Characters of a commit: twelve digits behind local-, as errors show it; --json has all."""
@@ -275,7 +275,7 @@ def gc(
     another user, or to clients on another machine that share the engine stays; root removes the
     containers and control groups of all users. Exit code 9: an installed engine did not answer.
     """
-    find = extras.required("envhub_sandbox.sandboxes.docker.leftovers", "find", "envhub cache gc")
+    find = extras.required("envhub_sandbox.extras.docker.leftovers", "find", "envhub cache gc")
     leftovers, unasked = find()
     removed = [] if dry_run else [leftover for leftover in leftovers if leftover.remove()]
     if json:

@@ -105,8 +105,10 @@ def doctor(
     Policy(profile=profile)  # refuses a name that there is not, before anything is tried
     if server is not None:
         what = "a server on another host"
-        place = extras.required("envhub_sandbox.sandboxes.remote", "RemoteSandbox", what)
-        examine_server = extras.required("envhub_sandbox.cli.doctor_server", "examine_server", what)
+        place = extras.required("envhub_sandbox.extras.remote.sandbox", "RemoteSandbox", what)
+        examine_server = extras.required(
+            "envhub_sandbox.extras.remote.doctor", "examine_server", what
+        )
         asked = place(server, insecure_loopback=insecure_loopback)
         raise typer.Exit(examine_server(asked, profile, json=json))
     if insecure_loopback:
@@ -195,7 +197,7 @@ def host() -> dict[str, Any]:
 
 def engine() -> dict[str, Any]:
     """The container engine that ``sandbox="docker"`` would use, or why there is none."""
-    module, what = "envhub_sandbox.sandboxes.docker.engines", "a container engine"
+    module, what = "envhub_sandbox.extras.docker.engines", "a container engine"
     try:
         container_engine = extras.required(module, "find_engine", what)(None)
     except EnvHubError as error:

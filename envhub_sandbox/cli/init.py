@@ -13,7 +13,7 @@ import typer
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, safe_line, say
 from envhub_sandbox.cli.shared.exits import UsageError
-from envhub_sandbox.hub.git.checkout import make_checkout
+from envhub_sandbox.hub.checkout import make_checkout
 
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9])?", re.ASCII)
 

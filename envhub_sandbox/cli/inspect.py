@@ -65,11 +65,15 @@ def inspect(
     """
     _check_options(context, static=static, download=download)
     if download:
-        download_all = extras.required("envhub_sandbox.cli.download", "download", "--download")
+        download_all = extras.required(
+            "envhub_sandbox.extras.packages.commands.download", "download", "--download"
+        )
         download_all(make, upgrade=upgrade, as_json=json)
         return
     if static:
-        read = extras.required("envhub_sandbox.cli.check.static", "inspect_static", "--static")
+        read = extras.required(
+            "envhub_sandbox.extras.judge.command.static", "inspect_static", "--static"
+        )
         read(ref, as_json=json, sarif=sarif, fail_on=fail_on, make=make)
         return
     arguments = make.arguments()
@@ -88,7 +92,7 @@ def inspect(
 
 def describe_env(suite: str, task: Any, env: Any) -> dict[str, Any]:
     """One environment as data. Trust: all of it is input from the worker."""
-    from envhub_sandbox.check.play.episodes import autoreset_mode
+    from envhub_sandbox.play.episodes import autoreset_mode
 
     metadata = dict(getattr(env, "metadata", None) or {})
     metadata.pop("autoreset_mode", None)

@@ -34,7 +34,7 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.settings.options import OPTIONS
 
 if TYPE_CHECKING:
-    from envhub_sandbox.check.play.episodes import EpisodeCounter
+    from envhub_sandbox.play.episodes import EpisodeCounter
 
 Verbose = Annotated[
     bool,
@@ -127,7 +127,7 @@ class _Run:
         """Run, print what there is to print even if it fails midway, and raise what failed."""
         try:
             if self.video is not None:
-                from envhub_sandbox.check.play.plays import check_target
+                from envhub_sandbox.play.plays import check_target
 
                 check_target(self.video)
             with (
@@ -163,8 +163,8 @@ class _Run:
     def _play_task(
         self, bar: ProgressBar, suite: str, task: int | str, env: Any, video: Path | None
     ) -> TaskResult:
-        from envhub_sandbox.check.play.episodes import autoreset_mode, rollout
-        from envhub_sandbox.check.play.plays import fps_of, frame_of, video_writer
+        from envhub_sandbox.play.episodes import autoreset_mode, rollout
+        from envhub_sandbox.play.plays import fps_of, frame_of, video_writer
 
         add: Callable[[Any], None] | None = None
 

@@ -301,7 +301,7 @@ def sandbox_of(sandbox: str | Sandbox | list[str | Sandbox]) -> Sandbox:
         place = fleet.opened(sandbox_of)
         return place
     if isinstance(sandbox, str) and sandbox.startswith("tcp://"):
-        place = _extra("remote", "RemoteSandbox")(sandbox)
+        place = _extra("remote.sandbox", "RemoteSandbox")(sandbox)
         return place
     if not isinstance(sandbox, str):
         if isinstance(sandbox, list) or not callable(getattr(sandbox, "for_repository", None)):
@@ -326,7 +326,7 @@ def _extra(module: str, name: str) -> Any:
     """What makes a place that is no part of the core, which therefore imports it by its name.
     Raises ``SandboxUnavailableError``: this installation lacks it.
     """
-    module, what = f"envhub_sandbox.sandboxes.{module}", option_name("sandbox")
+    module, what = f"envhub_sandbox.extras.{module}", option_name("sandbox")
     return extras.required(module, name, what, f"use {option_name('sandbox', 'process')}")
 
 

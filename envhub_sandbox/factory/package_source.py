@@ -15,7 +15,7 @@ from envhub_sandbox.settings.options import Options, option_name
 from envhub_sandbox.system import extras
 from envhub_worker.protocol.manifest.manifest import Manifest
 
-_EXTRA = "envhub_sandbox.dependencies.source"
+_EXTRA = "envhub_sandbox.extras.packages.source"
 
 
 class PackageSource:

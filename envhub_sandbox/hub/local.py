@@ -28,7 +28,7 @@ from envhub_sandbox.errors import (
     SnapshotError,
     SnapshotTooLargeError,
 )
-from envhub_sandbox.hub.git.checkout import Checkout, read_checkout
+from envhub_sandbox.hub.checkout import Checkout, read_checkout
 from envhub_sandbox.hub.grammar import DEFAULT_PATH, FILE, FOLDER, local_reference
 from envhub_sandbox.hub.listing import (
     DEFAULT_LIMITS,

@@ -48,13 +48,13 @@ GIT, PYPI = "git", "pypi"
 _SCHEMES = (
     _Scheme(
         GIT,
-        "envhub_sandbox.hub.git.address",
+        "envhub_sandbox.extras.sources.git_address",
         (
             *("git+http:", "git+https:", "git+file:", "git+ext:", "github:"),
             *("https://github.com/", "https://www.github.com/", "github.com/"),
         ),
     ),
-    _Scheme(PYPI, "envhub_sandbox.hub.registered", ("pypi:",)),
+    _Scheme(PYPI, "envhub_sandbox.extras.sources.registered", ("pypi:",)),
 )
 
 

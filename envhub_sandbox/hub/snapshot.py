@@ -169,7 +169,7 @@ def _candidates(
 ) -> Sequence[_Candidate]:
     """As what it may be read."""
     if ref.repo_type == GIT:
-        host_of = extras.required("envhub_sandbox.hub.git.commits", "GitHost", str(ref))
+        host_of = extras.required("envhub_sandbox.extras.sources.git_commits", "GitHost", str(ref))
         scheme, _, rest = ref.repo_id.partition("://")
         place, _, name = rest.partition("/")
         host: RepositoryHost = host_of(f"{scheme}://{place}")
@@ -231,7 +231,7 @@ def with_assets(
     """The snapshot with its assets: see ``hub.sources.assets``. Without that extra a card's are not
     looked for. Raises ``SandboxUnavailableError``: others are asked for.
     """
-    module, name = "envhub_sandbox.hub.sources.assets", "with_assets"
+    module, name = "envhub_sandbox.extras.sources.assets", "with_assets"
     if given or locked:
         extras.required(module, name, option_name("assets"))
     extra = extras.find(module, name)
@@ -272,7 +272,9 @@ def local(folder: str | Path, *, allow_secrets: bool = False) -> Snapshot:
 
 def _registered(ref: HubRef) -> Snapshot:
     """The repository of one file that stands for an environment of a package."""
-    text: bytes = extras.required("envhub_sandbox.hub.registered", "entry", str(ref))(ref.parts)
+    text: bytes = extras.required("envhub_sandbox.extras.sources.registered", "entry", str(ref))(
+        ref.parts
+    )
     digest = f"{SHA256}:{hashlib.sha256(text).hexdigest()}"
     files = (FileRecord(DEFAULT_PATH, len(text), digest),)
     name = str(ref).partition(":")[2]

@@ -170,7 +170,7 @@ class ProcessSandbox(Sandbox):
 
     def package_target(self) -> Any:
         """Packages are made for the interpreters of this machine."""
-        return extras.find("envhub_sandbox.dependencies.packages", "HERE")
+        return extras.find("envhub_sandbox.extras.packages.packages", "HERE")
 
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0

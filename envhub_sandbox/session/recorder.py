@@ -67,5 +67,5 @@ class Recorder:
 
 def recorder_for(limit: int) -> Recorder:
     """A recorder of at most ``limit`` requests."""
-    history = extras.find("envhub_sandbox.session.crash.history", "History") if limit else None
+    history = extras.find("envhub_sandbox.extras.crash.history", "History") if limit else None
     return Recorder() if history is None else history(limit)

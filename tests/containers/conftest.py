@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.errors import SandboxUnavailableError
-from envhub_sandbox.sandboxes.docker.engines import Engine, find_engine, find_image
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.extras.docker.engines import Engine, find_engine, find_image
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 from tests.attacks import table
 from tests.attacks.harness import USER
 from tests.compliance.conftest import pytest_generate_tests

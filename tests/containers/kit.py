@@ -12,9 +12,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.sandboxes.docker.engines import Engine
-from envhub_sandbox.sandboxes.docker.run_arguments import CLIENT_LABEL, SNAPSHOT
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.extras.docker.engines import Engine
+from envhub_sandbox.extras.docker.run_arguments import CLIENT_LABEL, SNAPSHOT
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 from envhub_sandbox.sandboxes.pool import stop_idle
 from tests.attacks.harness import Arena, Run, answered, new_alias
 from tests.support.processes import eventually

@@ -14,9 +14,9 @@ from pathlib import Path
 import psutil
 import pytest
 
+from envhub_sandbox.extras.docker.engines import Engine
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.sandboxes.docker.engines import Engine
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from tests.attacks.harness import HOSTILE, token
 from tests.attacks.network.listeners import listening, sends
 from tests.attacks.processes.victim import victim

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 from tests.compliance.pair import Pair
 from tests.compliance.vector_env import Case, VectorEnvCompliance, cases, paired
 from tests.support import inside

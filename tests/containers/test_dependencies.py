@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.dependencies import environments, interpreters
-from envhub_sandbox.sandboxes.docker import packages
-from envhub_sandbox.sandboxes.docker.engines import Engine, find_image
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.extras.docker import packages
+from envhub_sandbox.extras.docker.engines import Engine, find_image
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
+from envhub_sandbox.extras.packages import environments, interpreters
 from tests.containers.kit import IMAGE
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel

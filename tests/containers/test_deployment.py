@@ -17,7 +17,7 @@ import yaml
 
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import WorkerDiedError
-from envhub_sandbox.sandboxes.docker.engines import Engine
+from envhub_sandbox.extras.docker.engines import Engine
 from tests.containers.kit import IMAGE
 from tests.support.ports import lasting_port
 from tests.support.processes import eventually

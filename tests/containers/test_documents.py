@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.sandboxes.docker.engines import Engine
+from envhub_sandbox.extras.docker.engines import Engine
 from tests.containers.kit import IMAGE
 from tests.hub.stub_hub import StubHub
 from tests.support.documents import blocks

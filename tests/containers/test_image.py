@@ -15,8 +15,8 @@ import pytest
 
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import DependencyError
-from envhub_sandbox.sandboxes.docker.engines import Engine
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.extras.docker.engines import Engine
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 from tests.containers.kit import IMAGE
 from tests.support.processes import eventually
 from tests.support.samples import SAMPLES

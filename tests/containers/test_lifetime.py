@@ -19,10 +19,10 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import WorkerDiedError, WorkerStartupError
-from envhub_sandbox.sandboxes.docker import leftovers
-from envhub_sandbox.sandboxes.docker.engines import Engine
-from envhub_sandbox.sandboxes.docker.run_arguments import FOLDER_LABEL, USER_LABEL
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.extras.docker import leftovers
+from envhub_sandbox.extras.docker.engines import Engine
+from envhub_sandbox.extras.docker.run_arguments import FOLDER_LABEL, USER_LABEL
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 from envhub_sandbox.sandboxes.process import CONTAINER, RuntimeFolder
 from tests.containers.kit import IMAGE, container_of, containers_of, folders, nothing_left, pids_in
 from tests.support.processes import descendants, eventually
@@ -41,7 +41,7 @@ def make_env(n_envs=1, use_async_envs=False):
 _CLIENT = """
 import json, os, sys
 from envhub_sandbox import make_env
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 docker = DockerSandbox(image=sys.argv[2], engine=sys.argv[3])
 suites = make_env(sys.argv[1], n_envs=2, sandbox=docker)
 env = suites.env

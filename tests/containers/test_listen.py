@@ -11,7 +11,7 @@ import pytest
 
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import WorkerDiedError
-from envhub_sandbox.sandboxes.docker.engines import Engine
+from envhub_sandbox.extras.docker.engines import Engine
 from tests.compliance.pair import Pair
 from tests.containers.kit import IMAGE
 from tests.support.processes import eventually

@@ -16,11 +16,11 @@ import pytest
 
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerDiedError
-from envhub_sandbox.sandboxes.docker.engines import Engine
-from envhub_sandbox.sandboxes.docker.published import PublishedServer
-from envhub_sandbox.sandboxes.docker.run_arguments import STATE
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
-from envhub_sandbox.transport.tcp import new_keys
+from envhub_sandbox.extras.docker.engines import Engine
+from envhub_sandbox.extras.docker.published import PublishedServer
+from envhub_sandbox.extras.docker.run_arguments import STATE
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
+from envhub_sandbox.extras.remote.tcp import new_keys
 from envhub_worker.protocol.keys import key_text
 from tests.containers.kit import IMAGE, container_of, folders, nothing_left
 from tests.support import inside

@@ -8,9 +8,9 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
-from envhub_sandbox.sandboxes.docker import container as docker_module
-from envhub_sandbox.sandboxes.docker.engines import Engine
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.extras.docker import container as docker_module
+from envhub_sandbox.extras.docker.engines import Engine
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 from tests.containers.kit import IMAGE, folders, nothing_left
 from tests.support.samples import sample
 from tests.support.started import started

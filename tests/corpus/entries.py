@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.check.checks import Severity
-from envhub_sandbox.check.judge import judge
-from envhub_sandbox.check.settings import JudgeOptions
+from envhub_sandbox.extras.judge.checks import Severity
+from envhub_sandbox.extras.judge.judge import judge
+from envhub_sandbox.extras.judge.settings import JudgeOptions
 
 _BASE = """
 import gymnasium as gym

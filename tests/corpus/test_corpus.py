@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.check.checks import CHECKS
+from envhub_sandbox.extras.judge.checks import CHECKS
 from tests.corpus.entries import Entry
 from tests.corpus.faults import FAULTS
 from tests.corpus.honest import HONEST

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import errors, make_env
-from envhub_sandbox.session.crash import bundle_writer
-from envhub_sandbox.session.crash.bundle_reader import load_bundle
+from envhub_sandbox.extras.crash import bundle_writer
+from envhub_sandbox.extras.crash.bundle_reader import load_bundle
 from envhub_worker.protocol import messages as m
 from tests.support.command_line import document, envhub
 from tests.support.processes import eventually

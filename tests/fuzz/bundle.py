@@ -12,8 +12,8 @@ from typing import Any
 from unittest.mock import Mock
 
 from envhub_sandbox.errors import BundleError, EnvHubError
-from envhub_sandbox.session.crash.bundle_reader import load_bundle, replayed_arguments, wishes
-from envhub_sandbox.session.crash.replay import replay
+from envhub_sandbox.extras.crash.bundle_reader import load_bundle, replayed_arguments, wishes
+from envhub_sandbox.extras.crash.replay import replay
 from tests.fuzz.oracle import demand
 from tests.fuzz.targets import Dice
 from tests.unit.client.session.test_bundle_reader import bundle as written

@@ -23,7 +23,7 @@ def _patient() -> Iterator[None]:
     A test of how soon a server counts as gone says by itself how soon.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("envhub_sandbox.transport.tcp.CONNECT_S", 60.0)
+        patch.setattr("envhub_sandbox.extras.remote.tcp.CONNECT_S", 60.0)
         for spot in (*inside.WAITS_FOR_A_SERVER, inside.WAIT_FOR_OUTPUT):
             patch.setattr(*spot, 60.0)
         yield
@@ -51,7 +51,7 @@ def wait_no_more(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     def hurry() -> None:
         for spot in inside.WAITS_FOR_A_SERVER:
             monkeypatch.setattr(*spot, 0.1)
-        monkeypatch.setattr("envhub_sandbox.transport.tcp.CONNECT_S", 0.5)
+        monkeypatch.setattr("envhub_sandbox.extras.remote.tcp.CONNECT_S", 0.5)
 
     return hurry
 

@@ -18,7 +18,7 @@ import pytest
 
 import envhub_worker.protocol
 from envhub_sandbox import RemoteSandbox
-from envhub_worker.cli import status
+from envhub_worker.extras.access.commands import status
 from tests.support import inside
 from tests.support.processes import eventually
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import zmq
 
-from envhub_worker.access.keys import KeyPair
+from envhub_worker.extras.access.keys import KeyPair
 from envhub_worker.protocol import messages as m
 from tests.remote.listening import Listening
 

@@ -8,7 +8,7 @@ from typing import Any
 import msgpack
 import pytest
 
-from envhub_worker.access import keys
+from envhub_worker.extras.access import keys
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from tests.remote.listening import Listening

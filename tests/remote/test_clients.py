@@ -12,7 +12,7 @@ import pytest
 
 from envhub_sandbox.transport.connection import remote_session_id
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_worker.access import keys
+from envhub_worker.extras.access import keys
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.keys import key_text

@@ -16,12 +16,12 @@ import psutil
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.dependencies.builds import download
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.sandboxes import remote
-from envhub_worker.access import packages as server_side
-from envhub_worker.access.packages import Packages
-from envhub_worker.access.quotas import BusyError, Quotas
+from envhub_sandbox.extras.packages.builds import download
+from envhub_sandbox.extras.remote import sandbox as remote
+from envhub_worker.extras.access import packages as server_side
+from envhub_worker.extras.access.packages import Packages
+from envhub_worker.extras.access.quotas import BusyError, Quotas
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
 from tests.remote.listening import Listening, listening
@@ -131,7 +131,7 @@ def test_without_the_program_that_makes_them_it_does_not_start(tmp_path: Path) -
     """An interpreter that has the worker and not the client is told what to install."""
     lacking = tmp_path / "lacking.py"
     lacking.write_text(
-        "import runpy, sys\nfrom envhub_worker.access import packages\n"
+        "import runpy, sys\nfrom envhub_worker.extras.access import packages\n"
         "packages.PROGRAM = 'no_such_package'\n"
         "from envhub_worker.__main__ import main\nsys.exit(main())\n"
     )
@@ -258,8 +258,8 @@ def silent_index() -> socket.socket:
 _SERVER = """
 import sys, time
 from pathlib import Path
-from envhub_worker.access.packages import Packages
-from envhub_worker.access.quotas import Quotas
+from envhub_worker.extras.access.packages import Packages
+from envhub_worker.extras.access.quotas import Quotas
 from envhub_worker.protocol import messages as m
 packages = Packages(Path(sys.argv[1]), Quotas())
 packages.need(b"a", m.NeedPackages((("wanted", "line 1"),), "", "", "", True), ())

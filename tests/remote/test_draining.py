@@ -14,7 +14,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
-from envhub_worker.access import keys
+from envhub_worker.extras.access import keys
 from envhub_worker.protocol import messages as m
 from tests.remote.listening import Listening, listening, worker
 from tests.remote.peers import peer

@@ -90,7 +90,7 @@ def test_nobody_at_the_other_end_is_said_to_be_so(
     repository: Path, server: Listening, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A port where nobody listens is an error in bounded time, not a wait for ever."""
-    monkeypatch.setattr("envhub_sandbox.transport.tcp.CONNECT_S", 2.0)
+    monkeypatch.setattr("envhub_sandbox.extras.remote.tcp.CONNECT_S", 2.0)
     endpoint = f"tcp://127.0.0.1:{lasting_port()}"
     with pytest.raises(SandboxUnavailableError, match="nothing answers at"):
         make_env(repository, sandbox=server.sandbox(endpoint=endpoint))

@@ -11,12 +11,12 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from envhub_sandbox.sandboxes import remote_repository
+from envhub_sandbox.extras.remote import repository as remote_repository
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_worker.access.quotas import Quotas
-from envhub_worker.access.store.blob_store import BLOCK_BYTES
-from envhub_worker.access.store.uploads import MAX_PIECE_BYTES, PREFIX, Uploads
+from envhub_worker.extras.access.quotas import Quotas
+from envhub_worker.extras.access.store.blob_store import BLOCK_BYTES
+from envhub_worker.extras.access.store.uploads import MAX_PIECE_BYTES, PREFIX, Uploads
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
 from tests.remote.listening import Listening, counting
@@ -234,7 +234,7 @@ def test_snapshots_and_their_folders_are_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The longest unused go; paths of too many steps are refused before any is made."""
-    monkeypatch.setattr("envhub_worker.access.store.uploads.MAX_TREES", 2)
+    monkeypatch.setattr("envhub_worker.extras.access.store.uploads.MAX_TREES", 2)
     uploads = Uploads(tmp_path / "store", Quotas())
     first, second = (uploads.tree(ALICE, bring(uploads, (name, b""))) for name in "ab")
     with pytest.raises(RefusedError, match="more than 2"):

@@ -19,33 +19,36 @@ from typing import Any
 
 import zmq
 
-from envhub_sandbox.check.play import confinement, task, traces
-from envhub_sandbox.dependencies import environments, interpreters, modules, resolutions, source
+from envhub_sandbox.extras.crash import bundle_writer
+from envhub_sandbox.extras.crash.recording import RecordedRequest
+from envhub_sandbox.extras.docker import container
+from envhub_sandbox.extras.judge.play import task, traces
+from envhub_sandbox.extras.packages import environments, interpreters, modules, source
+from envhub_sandbox.extras.packages.resolution import resolutions
+from envhub_sandbox.extras.remote import sandbox as remote
+from envhub_sandbox.extras.remote import tcp
 from envhub_sandbox.factory import make_env
-from envhub_sandbox.sandboxes import remote
-from envhub_sandbox.sandboxes.docker import container
+from envhub_sandbox.play import confinement
 from envhub_sandbox.session import env_session
 from envhub_sandbox.session import launcher as launcher_module
 from envhub_sandbox.session.counters import Ledger
-from envhub_sandbox.session.crash import bundle_writer
-from envhub_sandbox.session.crash.recording import RecordedRequest
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.launcher import Launcher, LoadedJail
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.repository import Recipe, Repository
 from envhub_sandbox.system import folders
-from envhub_sandbox.transport import output, tcp
+from envhub_sandbox.transport import output
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
-from envhub_worker.access.audit.log import Log
-from envhub_worker.access.curve_port import ConnectionLimiter
-from envhub_worker.access.remote_gate import RemoteGate
-from envhub_worker.cli import listen, listen_options
-from envhub_worker.cli import status as status_command
-from envhub_worker.cli.identity import Identity
+from envhub_worker.extras.access.audit.log import Log
+from envhub_worker.extras.access.commands import listen, listen_options
+from envhub_worker.extras.access.commands import status as status_command
+from envhub_worker.extras.access.commands.identity import Identity
+from envhub_worker.extras.access.curve_port import ConnectionLimiter
+from envhub_worker.extras.access.remote_gate import RemoteGate
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.lockdown.stages import runner as stages_runner
 from envhub_worker.protocol import messages as m

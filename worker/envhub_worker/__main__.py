@@ -39,8 +39,8 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 
-from envhub_worker import extras
-from envhub_worker.cli import serve
+from envhub_worker.find_extra import find_extra
+from envhub_worker.server import serve
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -104,7 +104,7 @@ def _add_others(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
         ("keygen", "make a CURVE key pair"),
         ("health", "test whether the server on this machine answers"),
     ):
-        command = extras.find(f"cli.{name}")
+        command = find_extra(f"access.commands.{name}")
         if command is not None:
             parser = commands.add_parser(name, help=what)
             command.add_arguments(parser)

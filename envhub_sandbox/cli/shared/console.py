@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
-    from envhub_sandbox.check.play.episodes import EpisodeCounter
+    from envhub_sandbox.play.episodes import EpisodeCounter
 
 _PLAIN_WIDTH = 120
 """Columns where there is no terminal to ask; only progress bars and boxes obey it."""

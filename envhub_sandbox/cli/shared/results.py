@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from envhub_sandbox.cli.shared.console import safe_line, show, show_rows
 
 if TYPE_CHECKING:
-    from envhub_sandbox.check.play.episodes import Rollout
+    from envhub_sandbox.play.episodes import Rollout
 
 _SHOWN_DIGITS = 12
 _SHOWN_PACKAGES = ("gymnasium", "numpy")
@@ -163,6 +163,6 @@ def _confinement(provenance: dict[str, Any], in_process: bool) -> list[tuple[str
         return [("confined by", "nothing: the code ran in this process")]
     if not provenance.get("layers"):
         return [("confined by", "nothing ran")]
-    from envhub_sandbox.check.play.confinement import Confinement
+    from envhub_sandbox.play.confinement import Confinement
 
     return list(Confinement.of(str(provenance.get("profile")), provenance, "").rows())

@@ -17,9 +17,6 @@ import yaml
 from huggingface_hub import hf_hub_download
 
 from envhub_sandbox import make_env
-from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.locks import lockfile
-from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
 from envhub_sandbox.errors import (
     EnvHubError,
     HubReferenceError,
@@ -29,7 +26,10 @@ from envhub_sandbox.errors import (
     SnapshotIntegrityError,
     SnapshotTooLargeError,
 )
-from envhub_sandbox.hub.sources import assets
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.locks import lockfile
+from envhub_sandbox.extras.packages.locks.pylock import PylockPackage, Wheel
+from envhub_sandbox.extras.sources import assets
 from tests.hub.stub_hub import StubHub, StubRepository
 from tests.support.repositories import STILL
 

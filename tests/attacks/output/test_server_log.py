@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.access import keys
-from envhub_worker.access.audit.log import FORMS, Log
+from envhub_worker.extras.access import keys
+from envhub_worker.extras.access.audit.log import FORMS, Log
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.keys import key_text

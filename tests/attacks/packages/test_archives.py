@@ -18,8 +18,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies.builds import apart
 from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.extras.packages.builds import apart
 from tests.attacks.packages.test_git_references import dripping
 from tests.support.packages.refusals import refused_dependency
 from tests.support.processes import eventually

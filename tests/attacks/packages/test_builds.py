@@ -12,9 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies import interpreters, resolutions
-from envhub_sandbox.dependencies.builds import build
 from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.builds import build
+from envhub_sandbox.extras.packages.resolution import resolutions
 from tests.attacks.harness import Arena, kill_named, new_alias, pids_named, token
 from tests.attacks.network.listeners import TCP, listening
 from tests.support.packages.sdists import backend, make_sdist

@@ -25,8 +25,9 @@ from envhub_sandbox.errors import (
     RepositoryUnavailableError,
     SnapshotTooLargeError,
 )
+from envhub_sandbox.extras.sources import git_address as address
+from envhub_sandbox.extras.sources import git_commits as commits
 from envhub_sandbox.hub.answers import HubFailure
-from envhub_sandbox.hub.git import address, commits
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
 from tests.support.packages.git_server import commit, git, git_served, make_repository, ran

@@ -17,13 +17,14 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.dependencies import index as places
-from envhub_sandbox.dependencies import interpreters, uv
-from envhub_sandbox.dependencies.bounds import measured
 from envhub_sandbox.errors import DependencyError, EnvHubError
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.bounds import measured
+from envhub_sandbox.extras.packages.resolution import index as places
+from envhub_sandbox.extras.packages.resolution import uv
 from envhub_sandbox.sandboxes.process import BOOTSTRAP
-from envhub_worker.access.packages import Packages
-from envhub_worker.access.quotas import Quotas
+from envhub_worker.extras.access.packages import Packages
+from envhub_worker.extras.access.quotas import Quotas
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
 from tests.remote.listening import listening

@@ -19,7 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
+from envhub_sandbox.extras.judge.command.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.hub.sources import parser
 from tests.corpus.entries import Entry
 from tests.hub.stub_hub import StubHub

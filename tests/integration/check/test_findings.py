@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.check import judge as judging
-from envhub_sandbox.check.checks import CHECKS, Severity
-from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.judge import judge
-from envhub_sandbox.check.play import traces
-from envhub_sandbox.check.play.probes import LEAK_CHECKS
-from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
+from envhub_sandbox.extras.judge import judge as judging
+from envhub_sandbox.extras.judge.checks import CHECKS, Severity
+from envhub_sandbox.extras.judge.findings import Report
+from envhub_sandbox.extras.judge.judge import judge
+from envhub_sandbox.extras.judge.play import traces
+from envhub_sandbox.extras.judge.play.probes import LEAK_CHECKS
+from envhub_sandbox.extras.judge.settings import JudgeOptions
 from envhub_sandbox.vector.pictures import png
 from tests.corpus.entries import Entry
 from tests.corpus.faults import FAULTS

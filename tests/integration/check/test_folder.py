@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.check.checks import Severity
-from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.judge import judge
-from envhub_sandbox.check.settings import JudgeOptions
+from envhub_sandbox.extras.judge.checks import Severity
+from envhub_sandbox.extras.judge.findings import Report
+from envhub_sandbox.extras.judge.judge import judge
+from envhub_sandbox.extras.judge.settings import JudgeOptions
 from envhub_sandbox.hub.snapshot import snapshot_named
 from tests.hub.olah_server import GitRepository, OlahServer
 from tests.support.command_line import envhub

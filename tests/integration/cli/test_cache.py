@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.cache import stored_snapshots
-from envhub_sandbox.dependencies import environments
+from envhub_sandbox.extras.packages import environments
 from envhub_sandbox.hub import snapshot
 from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.system.locks import SharedLock

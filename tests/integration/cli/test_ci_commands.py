@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.cli import doctor_server
 from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.errors import WorkerDiedError
-from envhub_sandbox.sandboxes.remote import ServerFacts
+from envhub_sandbox.extras.remote import doctor as doctor_server
+from envhub_sandbox.extras.remote.sandbox import ServerFacts
 from tests.support.output.ci import log_of, obeyed
 from tests.support.repositories import write_repository
 

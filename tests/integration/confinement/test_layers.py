@@ -195,7 +195,7 @@ class Late(Still):
     def own_path(self):
         return sys.modules["envhub_worker"].__file__
     def late(self):
-        import envhub_worker.cli.health
+        import envhub_worker.extras.access.commands.health
         return "imported"
     def unsendable(self):
         endless = []

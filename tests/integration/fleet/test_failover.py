@@ -170,7 +170,7 @@ def test_a_server_that_comes_back_gets_workers_again(
     rows: Path, stays: Listening, serve: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At the same address, with the same key: the next workers that start go there, too."""
-    monkeypatch.setattr("envhub_sandbox.transport.tcp.CONNECT_S", 2.0)
+    monkeypatch.setattr("envhub_sandbox.extras.remote.tcp.CONNECT_S", 2.0)
     bind = f"tcp://127.0.0.1:{lasting_port()}"
     goes = serve("goes", bind=bind)
     sandbox = [stays.sandbox(), goes.sandbox()]

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import LoadError, RepositoryUnavailableError, SnapshotTooLargeError
-from envhub_sandbox.hub.git import address
+from envhub_sandbox.extras.sources import git_address as address
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import SnapshotLimits, fetch, snapshot_named
 from tests.support.packages.git_server import commit, git, git_served, make_repository

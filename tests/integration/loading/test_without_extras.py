@@ -83,7 +83,7 @@ def test_the_core_needs_no_extra(core: Path) -> None:
     assert [line.partition(", which this")[0] for line in refused] == [
         f"{what} needs envhub_sandbox.{module}" for _, _, what, module in _ASKED
     ]
-    assert "installed without envhub_worker.lockdown.seccomp.evidence" in record
+    assert "installed without envhub_worker.extras.denials" in record
 
 
 def test_the_commands_of_the_core_run(core: Path, checkout: Path) -> None:

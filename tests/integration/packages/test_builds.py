@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.builds import wheels
-from envhub_sandbox.dependencies.declared import Source
-from envhub_sandbox.dependencies.locks import lockfile
-from envhub_sandbox.dependencies.locks.making import locked
-from envhub_sandbox.dependencies.request import Choice
-from envhub_sandbox.dependencies.resolutions import build
 from envhub_sandbox.errors import DependencyError
-from envhub_sandbox.hub.git import address
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.builds import wheels
+from envhub_sandbox.extras.packages.declared import Source
+from envhub_sandbox.extras.packages.locks import lockfile
+from envhub_sandbox.extras.packages.locks.making import locked
+from envhub_sandbox.extras.packages.request import Choice
+from envhub_sandbox.extras.packages.resolution.resolutions import build
+from envhub_sandbox.extras.sources import git_address as address
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.system.folders import cache_root, remove_tree
 from tests.support.packages.git_server import git_served, make_repository

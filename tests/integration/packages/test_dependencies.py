@@ -18,11 +18,11 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.check.judge import judge
-from envhub_sandbox.check.settings import JudgeOptions
-from envhub_sandbox.dependencies.locks.making import locked
-from envhub_sandbox.dependencies.request import Choice
 from envhub_sandbox.errors import DependencyError, DependencyReason, LoadError
+from envhub_sandbox.extras.judge.judge import judge
+from envhub_sandbox.extras.judge.settings import JudgeOptions
+from envhub_sandbox.extras.packages.locks.making import locked
+from envhub_sandbox.extras.packages.request import Choice
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.sandboxes.process import BOOTSTRAP
 from envhub_sandbox.system.log import DEPENDENCIES

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.dependencies import resolutions
 from envhub_sandbox.errors import LockDriftError, LockError, PolicyError
+from envhub_sandbox.extras.packages.resolution import resolutions
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.repositories import importing, write_repository

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import LoadError, WorkerDiedError
-from envhub_sandbox.session.crash.bundle_reader import load_bundle
+from envhub_sandbox.extras.crash.bundle_reader import load_bundle
 from tests.support.compare import assert_same, rolled
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel

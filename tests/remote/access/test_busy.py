@@ -13,8 +13,8 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, ServerBusyError, WorkerError
-from envhub_sandbox.sandboxes.remote import RemoteSandbox
-from envhub_worker.access import keys
+from envhub_sandbox.extras.remote.sandbox import RemoteSandbox
+from envhub_worker.extras.access import keys
 from envhub_worker.protocol import messages as m
 from tests.remote.listening import Listening, listening
 from tests.remote.peers import peer

@@ -18,8 +18,8 @@ import pytest
 
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
-from envhub_sandbox.sandboxes import remote
-from envhub_worker.access import keys
+from envhub_sandbox.extras.remote import sandbox as remote
+from envhub_worker.extras.access import keys
 from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import WORKER, Listening, listening, worker
 from tests.support.command_line import below, gone

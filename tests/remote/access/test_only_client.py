@@ -13,8 +13,8 @@ import pytest
 
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import SandboxUnavailableError
-from envhub_sandbox.sandboxes.docker import attestation
-from envhub_sandbox.transport.tcp import new_keys
+from envhub_sandbox.extras.docker import attestation
+from envhub_sandbox.extras.remote.tcp import new_keys
 from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import WORKER, worker
 from tests.support.ports import lasting_port

@@ -11,9 +11,9 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, WorkerError
-from envhub_sandbox.sandboxes.remote import check_policy as check_place
+from envhub_sandbox.extras.remote.sandbox import check_policy as check_place
 from envhub_sandbox.settings.policy import Policy
-from envhub_worker.access.quotas import (
+from envhub_worker.extras.access.quotas import (
     BusyError,
     InFlight,
     Permissions,
@@ -23,10 +23,10 @@ from envhub_worker.access.quotas import (
     check_policy,
     use_of,
 )
-from envhub_worker.access.sessions import MAX_HELD, Sessions
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement, Limits
 from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.server.sessions import MAX_HELD, Sessions
 from envhub_worker.supervisor.records import Asker
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.access import keys
+from envhub_worker.extras.access import keys
 from envhub_worker.protocol import messages as m
 from tests.remote.listening import Listening, listening, worker
 from tests.remote.peers import peer

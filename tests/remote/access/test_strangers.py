@@ -19,20 +19,20 @@ from zmq.utils.monitor import parse_monitor_message
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
-from envhub_sandbox.transport.tcp import TcpLink
-from envhub_worker.access import keys
-from envhub_worker.access.audit.log import LINES, PERIOD_S, Log
-from envhub_worker.access.curve_port import ConnectionLimiter
-from envhub_worker.access.gate import Incoming
-from envhub_worker.access.keys import AuthorizedClients
-from envhub_worker.access.packages import Packages
-from envhub_worker.access.quotas import Permissions, Quotas, Rules
-from envhub_worker.access.remote_gate import RemoteGate
-from envhub_worker.access.sessions import Sessions
-from envhub_worker.access.store.uploads import Uploads
+from envhub_sandbox.extras.remote.tcp import TcpLink
+from envhub_worker.extras.access import keys
+from envhub_worker.extras.access.audit.log import LINES, PERIOD_S, Log
+from envhub_worker.extras.access.curve_port import ConnectionLimiter
+from envhub_worker.extras.access.keys import AuthorizedClients
+from envhub_worker.extras.access.packages import Packages
+from envhub_worker.extras.access.quotas import Permissions, Quotas, Rules
+from envhub_worker.extras.access.remote_gate import RemoteGate
+from envhub_worker.extras.access.store.uploads import Uploads
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
+from envhub_worker.server.gate import Incoming
+from envhub_worker.server.sessions import Sessions
 from envhub_worker.supervisor.records import Asker, RefusedError, Witness
 from tests.remote.listening import Listening, listening
 from tests.remote.peers import peer

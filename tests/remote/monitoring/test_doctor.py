@@ -9,8 +9,8 @@ from typing import Any
 from typer.testing import CliRunner
 
 from envhub_sandbox.cli.app import app
-from envhub_worker.access import keys
-from envhub_worker.access.quotas import Quotas
+from envhub_worker.extras.access import keys
+from envhub_worker.extras.access.quotas import Quotas
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import Listening, listening

@@ -15,9 +15,9 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, ServerBusyError, WorkerDiedError
-from envhub_worker.access import keys
-from envhub_worker.access.audit.log import LEVELS
-from envhub_worker.access.keys import KeyPair
+from envhub_worker.extras.access import keys
+from envhub_worker.extras.access.audit.log import LEVELS
+from envhub_worker.extras.access.keys import KeyPair
 from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually

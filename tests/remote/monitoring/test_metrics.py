@@ -23,9 +23,13 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
-from envhub_worker.cli import http_port
-from envhub_worker.cli.http_port import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpPort
-from envhub_worker.cli.metrics import STALE_S, MetricsPage
+from envhub_worker.extras.access.commands import http_port
+from envhub_worker.extras.access.commands.http_port import (
+    MAX_CONNECTIONS,
+    MAX_REQUEST_BYTES,
+    HttpPort,
+)
+from envhub_worker.extras.access.commands.metrics import STALE_S, MetricsPage
 from tests.remote.listening import listening
 from tests.remote.monitoring.watched import Watched, get, watched
 from tests.remote.strangers import hears, knock

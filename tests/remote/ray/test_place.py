@@ -13,7 +13,7 @@ import pytest
 
 from envhub_sandbox import RaySandbox, make_env
 from envhub_sandbox.errors import PolicyError, ServerBusyError
-from envhub_sandbox.sandboxes import remote_repository
+from envhub_sandbox.extras.remote import repository as remote_repository
 from envhub_sandbox.sandboxes.pool import stop_idle
 from tests.compliance.conftest import pytest_generate_tests as pytest_generate_tests
 from tests.compliance.pair import Pair

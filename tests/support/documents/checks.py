@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import textwrap
 
-from envhub_sandbox.check.checks import CHECKS
-from envhub_sandbox.cli.check.check import SETTINGS
+from envhub_sandbox.extras.judge.checks import CHECKS
+from envhub_sandbox.extras.judge.command.check import SETTINGS
 from tests.support.documents.written import DOCS, filled
 
 DOCUMENT = DOCS / "checks.md"

@@ -35,9 +35,9 @@ from typing import Any
 
 _SHARED = ("attachment", "column_lane", "lane")
 LINUX_ALONE = (
-    "envhub_sandbox.dependencies.for_a_server",
-    "envhub_sandbox.sandboxes.docker.monitor",
-    "envhub_sandbox.sandboxes.ray.actor",
+    "envhub_sandbox.extras.packages.for_a_server",
+    "envhub_sandbox.extras.docker.monitor",
+    "envhub_sandbox.extras.ray.actor",
     *(f"envhub_sandbox.transport.shared_memory.{name}" for name in _SHARED),
     "envhub_worker.protocol.shared_memory.descriptors",
 )

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import uv
 
-from envhub_sandbox.dependencies import index
+from envhub_sandbox.extras.packages.resolution import index
 from envhub_worker.protocol.runtime import Runtime
 from tests.support import inside
 

@@ -8,7 +8,7 @@ import tarfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from envhub_sandbox.dependencies.declared import Source
+from envhub_sandbox.extras.packages.declared import Source
 
 BACKEND = """
 import base64, hashlib, zipfile

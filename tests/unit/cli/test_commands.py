@@ -17,16 +17,17 @@ import pytest
 from typer.testing import CliRunner
 
 from envhub_sandbox import __version__
-from envhub_sandbox.check import reports
-from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.cli import cache, doctor_server, init
+from envhub_sandbox.cli import cache, init
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.cli.check import static
-from envhub_sandbox.cli.shared import exits, findings, host
+from envhub_sandbox.cli.shared import exits, host
 from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.cli.shared.exits import Exit
-from envhub_sandbox.hub.git.checkout import make_checkout
-from envhub_sandbox.sandboxes.remote import RemoteSandbox
+from envhub_sandbox.extras.judge import reports
+from envhub_sandbox.extras.judge.command import findings, static
+from envhub_sandbox.extras.judge.findings import Finding, Report
+from envhub_sandbox.extras.remote import doctor as doctor_server
+from envhub_sandbox.extras.remote.sandbox import RemoteSandbox
+from envhub_sandbox.hub.checkout import make_checkout
 from envhub_worker.protocol import messages as m
 from tests.attacks.client.lying_server import LyingServer, lying
 

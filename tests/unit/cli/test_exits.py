@@ -16,11 +16,11 @@ import pytest
 import typer
 
 from envhub_sandbox import errors
-from envhub_sandbox.check.play.episodes import Episode, Rollout, RolloutError
 from envhub_sandbox.cli.shared.console import plain, print_json, safe_line
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, code_for, describe, reported
 from envhub_sandbox.cli.shared.results import TaskResult, returns_of, statistics, task_document
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.play.episodes import Episode, Rollout, RolloutError
 from envhub_worker.protocol.text import quoted
 
 CODES = {

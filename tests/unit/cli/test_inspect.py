@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from envhub_sandbox.check.changes import changes
-from envhub_sandbox.check.checks import Severity
-from envhub_sandbox.check.static import static
 from envhub_sandbox.cli.app import app
+from envhub_sandbox.extras.judge.changes import changes
+from envhub_sandbox.extras.judge.checks import Severity
+from envhub_sandbox.extras.judge.static import static
 from envhub_sandbox.hub.listing import GIT_SHA1, FileRecord, Snapshot, digest_of
 from envhub_sandbox.hub.snapshot import local
 from tests.support.output.ci import obeyed

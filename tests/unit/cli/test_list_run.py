@@ -15,18 +15,18 @@ import pytest
 import typer
 from typer.testing import CliRunner, Result
 
-from envhub_sandbox.check.checks import Severity
-from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.references import ListEntry
 from envhub_sandbox.cli.app import app, whole_command
-from envhub_sandbox.cli.check import check as command
-from envhub_sandbox.cli.check.check import SETTINGS
-from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
-from envhub_sandbox.cli.check.list_run import ListRun
 from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.cli.shared.exits import Exit
 from envhub_sandbox.errors import SnapshotError, remote_error
-from envhub_sandbox.hub.git.checkout import make_checkout
+from envhub_sandbox.extras.judge.checks import Severity
+from envhub_sandbox.extras.judge.command import check as command
+from envhub_sandbox.extras.judge.command.check import SETTINGS
+from envhub_sandbox.extras.judge.command.deadline import DeadlineReached, deadline_alarm
+from envhub_sandbox.extras.judge.command.list_run import ListRun
+from envhub_sandbox.extras.judge.findings import Report
+from envhub_sandbox.extras.judge.references import ListEntry
+from envhub_sandbox.hub.checkout import make_checkout
 from tests.support.output.pages import HOSTILE
 
 _RUNNER = CliRunner()

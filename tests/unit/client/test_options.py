@@ -83,7 +83,7 @@ def test_a_place_that_is_not_installed_is_named(
     sandbox: Any, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As where the package was installed without its module; with it, there is such a place."""
-    lacking = f"envhub_sandbox.sandboxes.{extra}"
+    lacking = f"envhub_sandbox.extras.{extra}"
     for name in [name for name in sys.modules if name.startswith(f"{lacking}.")]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, lacking, None)

@@ -61,7 +61,9 @@ def held(words: list[str]) -> None:
         assert done.exit_code == 0, (words, done.output)
     elif program == "envhub-worker":
         parser = argparse.ArgumentParser()
-        importlib.import_module(f"envhub_worker.cli.{rest[0]}").add_arguments(parser)
+        importlib.import_module(f"envhub_worker.extras.access.commands.{rest[0]}").add_arguments(
+            parser
+        )
         known = set(re.findall(r"--[\w-]+", parser.format_help()))
         assert {word for word in rest if word.startswith("--")} <= known
     elif program in ("python", "python3") and rest[0] == "-m":

@@ -14,10 +14,10 @@ from typing import Any
 
 import pytest
 
-from envhub_worker.access.audit.figures import Client, facts_for_clients, facts_for_operators
-from envhub_worker.access.keys import AuthorizedClients
-from envhub_worker.access.quotas import Permissions, Quotas, Rules
-from envhub_worker.cli import identity, listen_options, metrics
+from envhub_worker.extras.access.audit.figures import Client, facts_for_clients, facts_for_operators
+from envhub_worker.extras.access.commands import identity, listen_options, metrics
+from envhub_worker.extras.access.keys import AuthorizedClients
+from envhub_worker.extras.access.quotas import Permissions, Quotas, Rules
 
 ROOT = Path(__file__).parents[3]
 UNIT = ROOT / "examples" / "deployment" / "envhub-worker.service"

@@ -14,39 +14,56 @@ from tests.unit.docs.test_imports import below, imported, modules
 # Each extra, and the packages and modules of it. Whatever is named in none of them is core.
 EXTRAS = {
     "check": {
-        *("envhub_sandbox.check", "envhub_sandbox.cli.check", "envhub_sandbox.cli.diff"),
-        "envhub_sandbox.cli.shared.findings",
+        *(
+            "envhub_sandbox.extras.judge",
+            "envhub_sandbox.extras.judge.command",
+            "envhub_sandbox.extras.judge.command.diff",
+        ),
+        "envhub_sandbox.extras.judge.command.findings",
     },
-    "crash": {"envhub_sandbox.cli.replay", "envhub_sandbox.session.crash"},
-    "denials": {"envhub_worker.lockdown.seccomp.evidence"},
-    "docker": {"envhub_sandbox.cli.image", "envhub_sandbox.sandboxes.docker"},
-    "fleet": {"envhub_sandbox.sandboxes.fleet"},
+    "crash": {"envhub_sandbox.extras.crash.command", "envhub_sandbox.extras.crash"},
+    "denials": {"envhub_worker.extras.denials"},
+    "docker": {"envhub_sandbox.extras.docker.command", "envhub_sandbox.extras.docker"},
+    "fleet": {"envhub_sandbox.extras.fleet"},
     "libraries": {"envhub_sandbox.integrations"},
-    "old gym": {"envhub_worker.runner.old_gym"},
+    "old gym": {"envhub_worker.extras.old_gym"},
     "packages": {
-        *("envhub_sandbox.cli.download", "envhub_sandbox.cli.lock", "envhub_sandbox.dependencies")
+        *(
+            "envhub_sandbox.extras.packages.commands.download",
+            "envhub_sandbox.extras.packages.commands.lock",
+            "envhub_sandbox.extras.packages",
+        )
     },
-    "ray": {"envhub_sandbox.sandboxes.ray"},
+    "ray": {"envhub_sandbox.extras.ray"},
     "remote": {
-        "envhub_sandbox.cli.doctor_server",
+        "envhub_sandbox.extras.remote.doctor",
         *(f"envhub_sandbox.sandboxes.{name}" for name in ("remote", "remote_keys")),
-        *("envhub_sandbox.sandboxes.remote_repository", "envhub_sandbox.transport.tcp"),
-        "envhub_worker.access",
-        *(f"envhub_worker.cli.{name}" for name in ("drain", "health", "http_port", "identity")),
-        *(f"envhub_worker.cli.{name}" for name in ("keygen", "listen", "listen_options")),
-        *(f"envhub_worker.cli.{name}" for name in ("metrics", "state_folder", "status")),
+        *("envhub_sandbox.extras.remote.repository", "envhub_sandbox.extras.remote.tcp"),
+        "envhub_worker.extras.access",
+        *(
+            f"envhub_worker.extras.access.commands.{name}"
+            for name in ("drain", "health", "http_port", "identity")
+        ),
+        *(
+            f"envhub_worker.extras.access.commands.{name}"
+            for name in ("keygen", "listen", "listen_options")
+        ),
+        *(
+            f"envhub_worker.extras.access.commands.{name}"
+            for name in ("metrics", "state_folder", "status")
+        ),
     },
     "sources": {  # of snapshots, beside the Hub and folders
-        *("envhub_sandbox.hub.git.address", "envhub_sandbox.hub.git.commits"),
-        "envhub_sandbox.hub.registered",
-        "envhub_sandbox.hub.sources.assets",
+        *("envhub_sandbox.extras.sources.git_address", "envhub_sandbox.extras.sources.git_commits"),
+        "envhub_sandbox.extras.sources.registered",
+        "envhub_sandbox.extras.sources.assets",
     },
 }
 # What lies in the folder of an extra, and is core: ``envhub run`` plays, and prints what confines;
 # every server has a gate, be it open, and sessions.
 CORE = {
-    *(f"envhub_sandbox.check.play.{name}" for name in ("confinement", "episodes", "plays")),
-    *(f"envhub_worker.access.{name}" for name in ("gate", "sessions")),
+    *(f"envhub_sandbox.extras.judge.play.{name}" for name in ("confinement", "episodes", "plays")),
+    *(f"envhub_worker.extras.access.{name}" for name in ("gate", "sessions")),
 }
 # The extras that an extra may import.
 EXTRAS_OF_EXTRAS = {

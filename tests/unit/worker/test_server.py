@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 import zmq
 
-from envhub_worker.access.audit.log import Events, Log, json_line
-from envhub_worker.access.gate import LocalGate
+from envhub_worker.extras.access.audit.log import Events, Log, json_line
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import RemoteProtocolError
-from envhub_worker.server import Server
+from envhub_worker.server.gate import LocalGate
+from envhub_worker.server.server import Server
 
 _PATIENCE_MS = 120_000
 LACKS = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from envhub_worker import extras
+from envhub_worker.find_extra import find_extra
 
 
 class _NoAdapter:
@@ -27,4 +27,4 @@ class _NoAdapter:
         return error
 
 
-old_gym: Any = extras.find("runner.old_gym") or _NoAdapter()
+old_gym: Any = find_extra("old_gym") or _NoAdapter()

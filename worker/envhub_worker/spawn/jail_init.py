@@ -32,7 +32,7 @@ import traceback
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
-from envhub_worker import extras
+from envhub_worker.find_extra import find_extra
 from envhub_worker.lockdown.context import Common, JailContext
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.limits.watchdog import Watchdog
@@ -48,7 +48,7 @@ from envhub_worker.spawn import runner_entry
 from envhub_worker.spawn.channel import Channel, close_fds
 
 # before anything is confined
-evidence = extras.find("lockdown.seccomp.evidence")
+evidence = find_extra("denials")
 
 
 def run(control: int, output: int, common: Common) -> NoReturn:
@@ -122,7 +122,7 @@ class Init:
         if spec.confinement.record_denials and evidence is None:
             raise LayerUnavailableError(
                 "record_denials",
-                "this worker is installed without envhub_worker.lockdown.seccomp.evidence",
+                "this worker is installed without envhub_worker.extras.denials",
                 "Install the whole package, or leave out record_denials.",
             )
         events, *joins = fds or [-1]

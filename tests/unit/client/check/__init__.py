@@ -1,1 +1,1 @@
-"""Unit tests of ``envhub_sandbox/check``."""
+"""Unit tests of ``envhub_sandbox/extras/judge``."""

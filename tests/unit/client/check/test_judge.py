@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.check.judge import is_moving
+from envhub_sandbox.extras.judge.judge import is_moving
 from envhub_sandbox.hub.listing import Snapshot
 
 _COMMIT = "0123456789" * 4

@@ -7,8 +7,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from envhub_sandbox.check import markup
-from envhub_sandbox.check.markup import bar_plot, histogram_plot, line_plot, number
+from envhub_sandbox.extras.judge import markup
+from envhub_sandbox.extras.judge.markup import bar_plot, histogram_plot, line_plot, number
 from tests.support.output.pages import Page
 
 _HOSTILE = "<script>alert(1)</script>\"'&\x1b[2J\u202e"

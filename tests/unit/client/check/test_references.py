@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.check.references import ListEntry, read_entries
 from envhub_sandbox.errors import HubReferenceError
+from envhub_sandbox.extras.judge.references import ListEntry, read_entries
 
 _COMMIT = "0123456789" * 4
 

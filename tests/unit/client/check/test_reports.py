@@ -8,11 +8,11 @@ from xml.etree import ElementTree
 
 import pytest
 
-from envhub_sandbox.check import reports
-from envhub_sandbox.check.checks import CHECKS, Severity
-from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.page import page
-from envhub_sandbox.check.play.confinement import Confinement
+from envhub_sandbox.extras.judge import reports
+from envhub_sandbox.extras.judge.checks import CHECKS, Severity
+from envhub_sandbox.extras.judge.findings import Finding, Report
+from envhub_sandbox.extras.judge.page import page
+from envhub_sandbox.play.confinement import Confinement
 from envhub_worker.protocol.text import printable
 from tests.support.output.pages import HOSTILE
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.check import settings
 from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.extras.judge import settings
 from envhub_sandbox.settings.policy import policy_from
 
 

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envhub_sandbox.check.checks import Severity
-from envhub_sandbox.check.static import Survey, survey
+from envhub_sandbox.extras.judge.checks import Severity
+from envhub_sandbox.extras.judge.static import Survey, survey
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.hub.sources import parser, parsing

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from envhub_sandbox.check.checks import Severity
-from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.static import survey
 from envhub_sandbox.errors import SnapshotError
-from envhub_sandbox.hub.git import checkout
+from envhub_sandbox.extras.judge.checks import Severity
+from envhub_sandbox.extras.judge.findings import Finding
+from envhub_sandbox.extras.judge.static import survey
+from envhub_sandbox.hub import checkout
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.hub.sources import parsing
 from tests.hub.olah_server import GitRepository

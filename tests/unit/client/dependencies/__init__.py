@@ -1,1 +1,1 @@
-"""Unit tests of ``envhub_sandbox/dependencies``."""
+"""Unit tests of ``envhub_sandbox/extras/packages``."""

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies import declared as module
-from envhub_sandbox.dependencies.declared import DeclaredPackages, declared, read
+from envhub_sandbox.extras.packages import declared as module
+from envhub_sandbox.extras.packages.declared import DeclaredPackages, declared, read
 from tests.support.packages.refusals import refused_dependency
 
 HASH = "sha256:" + "0a" * 32

@@ -16,12 +16,13 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import bounds, environments, uv
-from envhub_sandbox.dependencies import index as index_settings
-from envhub_sandbox.dependencies.environments import Environment
-from envhub_sandbox.dependencies.packages import ThisMachine
-from envhub_sandbox.dependencies.request import chosen, request_of
 from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.extras.packages import bounds, environments
+from envhub_sandbox.extras.packages.environments import Environment
+from envhub_sandbox.extras.packages.packages import ThisMachine
+from envhub_sandbox.extras.packages.request import chosen, request_of
+from envhub_sandbox.extras.packages.resolution import index as index_settings
+from envhub_sandbox.extras.packages.resolution import uv
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.system.locks import SharedLock
 from envhub_worker.protocol.runtime import RECORD

@@ -9,16 +9,23 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import interpreters, resolutions
-from envhub_sandbox.dependencies import resolve as resolving
-from envhub_sandbox.dependencies.interpreters import Interpreter
-from envhub_sandbox.dependencies.locks import day
-from envhub_sandbox.dependencies.locks.day import of_its_day, written
-from envhub_sandbox.dependencies.modules import MissingModule, guessed, note_missing
-from envhub_sandbox.dependencies.packages import packages_for
-from envhub_sandbox.dependencies.request import AUTO, DECLARED, PackageRequest, chosen, request_of
-from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import DependencyError, PolicyError, load_error, remote_error
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.interpreters import Interpreter
+from envhub_sandbox.extras.packages.locks import day
+from envhub_sandbox.extras.packages.locks.day import of_its_day, written
+from envhub_sandbox.extras.packages.modules import MissingModule, guessed, note_missing
+from envhub_sandbox.extras.packages.packages import packages_for
+from envhub_sandbox.extras.packages.request import (
+    AUTO,
+    DECLARED,
+    PackageRequest,
+    chosen,
+    request_of,
+)
+from envhub_sandbox.extras.packages.resolution import resolutions
+from envhub_sandbox.extras.packages.resolution import resolve as resolving
+from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target
 from envhub_sandbox.hub.snapshot import Snapshot, local, snapshot_named
 from envhub_sandbox.hub.sources import parsing
 from tests.hub.stub_hub import StubHub

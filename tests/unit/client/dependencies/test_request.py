@@ -13,11 +13,12 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.declared import parse_requirement
-from envhub_sandbox.dependencies.modules import MissingModule
-from envhub_sandbox.dependencies.packages import HERE
-from envhub_sandbox.dependencies.request import (
+from envhub_sandbox.errors import DependencyError, PolicyError
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.declared import parse_requirement
+from envhub_sandbox.extras.packages.modules import MissingModule
+from envhub_sandbox.extras.packages.packages import HERE
+from envhub_sandbox.extras.packages.request import (
     AUTO,
     DECLARED,
     HOST,
@@ -25,7 +26,6 @@ from envhub_sandbox.dependencies.request import (
     chosen,
     request_of,
 )
-from envhub_sandbox.errors import DependencyError, PolicyError
 from envhub_sandbox.hub.snapshot import Snapshot, local
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import make_wheel

@@ -12,12 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies import interpreters, packages, resolutions, resolve
-from envhub_sandbox.dependencies.declared import Source, of_git, parse_requirement
-from envhub_sandbox.dependencies.interpreters import Interpreter
-from envhub_sandbox.dependencies.request import PackageRequest
-from envhub_sandbox.dependencies.resolutions import resolution_for
-from envhub_sandbox.dependencies.resolve import Lock
+from envhub_sandbox.extras.packages import interpreters, packages
+from envhub_sandbox.extras.packages.declared import Source, of_git, parse_requirement
+from envhub_sandbox.extras.packages.interpreters import Interpreter
+from envhub_sandbox.extras.packages.request import PackageRequest
+from envhub_sandbox.extras.packages.resolution import resolutions, resolve
+from envhub_sandbox.extras.packages.resolution.resolutions import resolution_for
+from envhub_sandbox.extras.packages.resolution.resolve import Lock
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 
@@ -229,7 +230,8 @@ def test_pytorchs_own_index_is_asked_only_by_who_has_chosen_none(
     monkeypatch.delenv("UV_TORCH_BACKEND", raising=False)
     for chosen, asked in ((True, [()]), (False, [(), ("--torch-backend", "cpu")])):
         monkeypatch.setattr(
-            "envhub_sandbox.dependencies.index.is_chosen", lambda chosen=chosen: chosen
+            "envhub_sandbox.extras.packages.resolution.index.is_chosen",
+            lambda chosen=chosen: chosen,
         )
         given: list[object] = []
 

@@ -17,13 +17,14 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import index as places
-from envhub_sandbox.dependencies import interpreters, resolutions, uv
-from envhub_sandbox.dependencies import resolve as module
-from envhub_sandbox.dependencies.declared import parse_requirement
-from envhub_sandbox.dependencies.request import PackageRequest, chosen
-from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.declared import parse_requirement
+from envhub_sandbox.extras.packages.request import PackageRequest, chosen
+from envhub_sandbox.extras.packages.resolution import index as places
+from envhub_sandbox.extras.packages.resolution import resolutions, uv
+from envhub_sandbox.extras.packages.resolution import resolve as module
+from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.sdists import backend, make_sdist
 from tests.support.packages.wheels import WORKERS, Index, make_wheel

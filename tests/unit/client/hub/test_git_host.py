@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.errors import SnapshotIntegrityError
-from envhub_sandbox.hub.git import commits
-from envhub_sandbox.hub.git.commits import GitHost
+from envhub_sandbox.extras.sources import git_commits as commits
+from envhub_sandbox.extras.sources.git_commits import GitHost
 from envhub_sandbox.hub.listing import FileRecord, Repository
 
 HOST = GitHost("https://git.example")

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.errors import HubReferenceError, PolicyError
+from envhub_sandbox.extras.remote.sandbox import RemoteSandbox
 from envhub_sandbox.hub.client import HubClient, checked_endpoint
 from envhub_sandbox.hub.logins import authorization, login_of, without_login
-from envhub_sandbox.sandboxes.remote import RemoteSandbox
 from envhub_sandbox.session.repository import Recipe
 
 SECRET = "s3cret"

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import HubReferenceError
+from envhub_sandbox.extras.sources.registered import entry
 from envhub_sandbox.hub.listing import Snapshot
 from envhub_sandbox.hub.reference import HubRef, is_local, pinned
-from envhub_sandbox.hub.registered import entry
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 SITE = "https://huggingface.co"

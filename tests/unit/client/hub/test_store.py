@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies import bounds
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
+from envhub_sandbox.extras.packages import bounds
 from envhub_sandbox.hub import store as store
 from envhub_sandbox.hub.listing import FileRecord, HashMismatch, copy_verified, digest_of
 from envhub_sandbox.system.folders import cache_root, remove_tree

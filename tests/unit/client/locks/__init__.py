@@ -1,1 +1,1 @@
-"""Unit tests of ``envhub_sandbox/dependencies/locks``."""
+"""Unit tests of ``envhub_sandbox/extras/packages/locks``."""

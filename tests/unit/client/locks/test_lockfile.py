@@ -12,14 +12,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envhub_sandbox.dependencies import interpreters, uv
-from envhub_sandbox.dependencies.locks import lockfile, making, pylock
-from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
-from envhub_sandbox.dependencies.locks.making import fingerprint_of_spaces, fingerprint_of_task
-from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
-from envhub_sandbox.dependencies.request import AUTO, chosen
-from envhub_sandbox.dependencies.source import RepositoryPackages
 from envhub_sandbox.errors import EnvHubError, LockDriftError, LockError
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.locks import lockfile, making, pylock
+from envhub_sandbox.extras.packages.locks.lockfile import LockFile, Runner, Spaces
+from envhub_sandbox.extras.packages.locks.making import fingerprint_of_spaces, fingerprint_of_task
+from envhub_sandbox.extras.packages.locks.pylock import PylockPackage, Wheel
+from envhub_sandbox.extras.packages.request import AUTO, chosen
+from envhub_sandbox.extras.packages.resolution import uv
+from envhub_sandbox.extras.packages.source import RepositoryPackages
 from envhub_sandbox.hub.snapshot import local
 from envhub_worker.protocol.manifest.manifest import Manifest
 from tests.support import wire

@@ -19,12 +19,12 @@ from envhub_sandbox.errors import (
     WorkerStartupError,
     WorkerTimeoutError,
 )
+from envhub_sandbox.extras.fleet.fleet import MOST_PLACES, Fleet, places_of
 from envhub_sandbox.factory.make_env import sandbox_of
-from envhub_sandbox.sandboxes.fleet.fleet import MOST_PLACES, Fleet, places_of
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.sandboxes.sandbox import is_list, may_go_elsewhere, worst_of
 from envhub_sandbox.transport.replies import UnreachableError
-from envhub_worker.access import keys
+from envhub_worker.extras.access import keys
 from envhub_worker.protocol.keys import key_text
 
 

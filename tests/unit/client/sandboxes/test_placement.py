@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies.packages import PackageSet
-from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import DependencyError, PolicyError
-from envhub_sandbox.sandboxes.fleet import placement as module
-from envhub_sandbox.sandboxes.fleet.member import FleetPackages, Member
-from envhub_sandbox.sandboxes.fleet.placement import Placement, Room
+from envhub_sandbox.extras.fleet import placement as module
+from envhub_sandbox.extras.fleet.member import FleetPackages, Member
+from envhub_sandbox.extras.fleet.placement import Placement, Room
+from envhub_sandbox.extras.packages.packages import PackageSet
+from envhub_sandbox.extras.packages.request import PackageRequest
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.transport.replies import UnreachableError

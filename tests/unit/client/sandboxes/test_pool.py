@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
+from envhub_sandbox.extras.docker import container as docker
+from envhub_sandbox.extras.docker.engines import Engine
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 from envhub_sandbox.sandboxes import pool as pool_module
-from envhub_sandbox.sandboxes.docker import container as docker
-from envhub_sandbox.sandboxes.docker.engines import Engine
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_sandbox.sandboxes.pool import ServerHold, ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.settings.policy import Policy
 from tests.support import inside

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.errors import SandboxUnavailableError
-from envhub_sandbox.sandboxes.docker import leftovers
-from envhub_sandbox.sandboxes.docker.run_arguments import FOLDER_LABEL, USER_LABEL
+from envhub_sandbox.extras.docker import leftovers
+from envhub_sandbox.extras.docker.run_arguments import FOLDER_LABEL, USER_LABEL
 from envhub_sandbox.sandboxes.process import (
     CONTAINER,
     SERVER,

@@ -17,10 +17,10 @@ import pytest
 
 from envhub_sandbox import RaySandbox
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
+from envhub_sandbox.extras.fleet.placement import Placement
+from envhub_sandbox.extras.ray import cluster, sandbox
+from envhub_sandbox.extras.ray.actor import WorkerActor
 from envhub_sandbox.factory.make_env import sandbox_of
-from envhub_sandbox.sandboxes.fleet.placement import Placement
-from envhub_sandbox.sandboxes.ray import cluster, sandbox
-from envhub_sandbox.sandboxes.ray.actor import WorkerActor
 from envhub_sandbox.settings.policy import Policy
 from envhub_worker.protocol.runtime import OWN, Runtime
 from tests.support.command_line import runs

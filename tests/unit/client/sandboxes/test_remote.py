@@ -13,10 +13,6 @@ from typing import Any
 import pytest
 import zmq
 
-from envhub_sandbox.dependencies.declared import parse_requirement
-from envhub_sandbox.dependencies.modules import Guess
-from envhub_sandbox.dependencies.packages import PackageSet
-from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import (
     DependencyError,
     PolicyError,
@@ -25,18 +21,24 @@ from envhub_sandbox.errors import (
     SnapshotError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.sandboxes import remote, remote_keys, remote_repository
-from envhub_sandbox.sandboxes.remote import facts_of
-from envhub_sandbox.sandboxes.remote_repository import (
+from envhub_sandbox.extras.packages.declared import parse_requirement
+from envhub_sandbox.extras.packages.modules import Guess
+from envhub_sandbox.extras.packages.packages import PackageSet
+from envhub_sandbox.extras.packages.request import PackageRequest
+from envhub_sandbox.extras.remote import keys as remote_keys
+from envhub_sandbox.extras.remote import repository as remote_repository
+from envhub_sandbox.extras.remote import sandbox as remote
+from envhub_sandbox.extras.remote.repository import (
     ServerPackages,
     UploadedRepository,
     order_of,
     request_packages,
 )
+from envhub_sandbox.extras.remote.sandbox import facts_of
+from envhub_sandbox.extras.remote.tcp import TcpServer
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.tcp import TcpServer
-from envhub_worker.access import keys
+from envhub_worker.extras.access import keys
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
 from tests.attacks.client.lying_server import Asked, Frames, LyingServer, LyingUse, lying

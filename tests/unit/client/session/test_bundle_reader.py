@@ -17,15 +17,15 @@ import pytest
 
 from envhub_sandbox.cli.shared.console import safe_line
 from envhub_sandbox.errors import ActionError, BundleError, WorkerDiedError
-from envhub_sandbox.session.crash import bundle_reader, bundle_writer
-from envhub_sandbox.session.crash.bundle_reader import (
+from envhub_sandbox.extras.crash import bundle_reader, bundle_writer
+from envhub_sandbox.extras.crash.bundle_reader import (
     MAX_DOCUMENT_BYTES,
     load_bundle,
     replayed_arguments,
     wishes,
 )
-from envhub_sandbox.session.crash.history import History
-from envhub_sandbox.session.crash.replay import Verdict, replay
+from envhub_sandbox.extras.crash.history import History
+from envhub_sandbox.extras.crash.replay import Verdict, replay
 from envhub_sandbox.session.recorder import Crash
 from envhub_worker.protocol import messages as m
 from tests.support import inside

@@ -124,7 +124,7 @@ def test_a_straggler_is_who_was_waited_for(counters: FleetCounters, parts: list[
 def test_without_the_extra_nothing_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
     """An installation may lack it: requests and deaths are as ever, and no bundle is named."""
     assert type(recorder_for(8)) is not Recorder  # the control
-    for missing in ("envhub_sandbox.session.crash", "envhub_sandbox.session.crash.history"):
+    for missing in ("envhub_sandbox.extras.crash", "envhub_sandbox.extras.crash.history"):
         monkeypatch.setitem(sys.modules, missing, None)
     lane = FakeLane()
     session = session_over(lane)

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_sandbox.session.crash import history
-from envhub_sandbox.session.crash.history import History
+from envhub_sandbox.extras.crash import history
+from envhub_sandbox.extras.crash.history import History
 from envhub_worker.protocol import messages as m
 from tests.support.compare import assert_same
 from tests.support.wire import requested

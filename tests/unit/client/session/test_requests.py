@@ -17,7 +17,7 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.session.crash.history import History
+from envhub_sandbox.extras.crash.history import History
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State

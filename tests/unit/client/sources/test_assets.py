@@ -16,9 +16,9 @@ from envhub_sandbox.errors import (
     RepositoryUnavailableError,
     SnapshotError,
 )
+from envhub_sandbox.extras.sources.assets import CardError, declared_assets, with_assets
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, fetch
-from envhub_sandbox.hub.sources.assets import CardError, declared_assets, with_assets
 from tests.hub.stub_hub import StubHub, StubRepository
 
 PIN = "a" * 40

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from envhub_sandbox.check.static import undeclared
+from envhub_sandbox.extras.judge.static import undeclared
 from envhub_sandbox.hub.snapshot import Snapshot, local
 from envhub_sandbox.hub.sources import parser, parsing
 from envhub_sandbox.hub.sources import parsing as source

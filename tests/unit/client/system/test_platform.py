@@ -105,7 +105,7 @@ time.sleep(3600)
 """
 _ALARMED = """
 import _thread, threading, time
-from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
+from envhub_sandbox.extras.judge.command.deadline import DeadlineReached, deadline_alarm
 
 def wait():  # Windows interrupts one sleep, Linux only what follows it
     for _ in range(600):
@@ -148,7 +148,7 @@ def test_every_module_can_be_imported(system: str) -> None:
     given = json.dumps([*alone, *_FACES]), json.dumps([*_GONE[system], "import os"])
     answer = json.loads(elsewhere(system, _LOOKS, *given, HF_TOKEN="secret"))
     found, has_drives, variables, there = answer
-    assert "envhub_sandbox.sandboxes.docker.published" in found
+    assert "envhub_sandbox.extras.docker.published" in found
     assert not [name for name in found if name in alone]
     assert there == ["import os"]
     assert has_drives is (system == "win32")

@@ -12,9 +12,9 @@ import zmq
 from zmq.utils import z85
 
 from envhub_sandbox.errors import SandboxUnavailableError
-from envhub_sandbox.sandboxes.remote import RemoteServer
+from envhub_sandbox.extras.remote.sandbox import RemoteServer
+from envhub_sandbox.extras.remote.tcp import TcpLink, TcpServer
 from envhub_sandbox.transport.replies import UnreachableError
-from envhub_sandbox.transport.tcp import TcpLink, TcpServer
 from tests.support import inside
 from tests.support.processes import eventually
 

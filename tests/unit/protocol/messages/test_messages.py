@@ -233,7 +233,7 @@ OF_A_SERVER = ("Hello", "OpenJail", "JailOpened", "Relay", "Death")
 WITHOUT_NUMPY = """
 import sys
 sys.path.insert(0, sys.argv[1])
-import envhub_worker.server
+import envhub_worker.server.server
 import envhub_worker
 from envhub_worker.protocol import messages as m
 for golden in sys.argv[2:-1]:

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 import pytest
 import zmq
 
-from envhub_worker.access.audit.log import Log
-from envhub_worker.access.curve_port import CurvePort
-from envhub_worker.access.sessions import Sessions
+from envhub_worker.extras.access.audit.log import Log
+from envhub_worker.extras.access.curve_port import CurvePort
 from envhub_worker.loop import Loop
+from envhub_worker.server.sessions import Sessions
 from tests.remote.strangers import greeting, knock, say
 from tests.support.processes import eventually
 

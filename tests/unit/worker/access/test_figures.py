@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from envhub_worker.access.audit import figures
+from envhub_worker.extras.access.audit import figures
 from tests.support.processes import eventually
 
 

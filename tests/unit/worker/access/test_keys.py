@@ -10,8 +10,8 @@ import pytest
 import zmq
 from zmq.utils import z85
 
-from envhub_worker.access import keys
-from envhub_worker.access.keys import AuthorizedClients
+from envhub_worker.extras.access import keys
+from envhub_worker.extras.access.keys import AuthorizedClients
 from envhub_worker.protocol.keys import key_text, parse_key
 
 ALICE, BOB = keys.generate().public, keys.generate().public

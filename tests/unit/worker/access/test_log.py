@@ -8,7 +8,7 @@ import os
 
 import pytest
 
-from envhub_worker.access.audit.log import CLIENT_LINES, FORMS, LINES, Log
+from envhub_worker.extras.access.audit.log import CLIENT_LINES, FORMS, LINES, Log
 
 
 def test_a_log_cannot_be_filled() -> None:

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from envhub_worker.access import packages
-from envhub_worker.access.quotas import Quotas
-from envhub_worker.access.store import uploads
+from envhub_worker.extras.access import packages
+from envhub_worker.extras.access.quotas import Quotas
+from envhub_worker.extras.access.store import uploads
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
 

@@ -10,9 +10,9 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from envhub_worker.access.places import Drain, Line, Places, longest_gone
-from envhub_worker.access.quotas import Quotas
-from envhub_worker.access.sessions import Sessions
+from envhub_worker.extras.access.places import Drain, Line, Places, longest_gone
+from envhub_worker.extras.access.quotas import Quotas
+from envhub_worker.server.sessions import Sessions
 
 
 def test_who_has_asked_twice_stands_before_who_comes_later() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from envhub_worker.access.sessions import CONNECTIONS_OF_ONE, Sessions
+from envhub_worker.server.sessions import CONNECTIONS_OF_ONE, Sessions
 
 
 def test_a_jail_that_is_used_is_held_though_its_client_no_longer_says_so() -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.access import keys
-from envhub_worker.access.keys import AuthorizedClients
-from envhub_worker.access.quotas import Quotas
-from envhub_worker.cli import http_port, identity, listen, listen_options
+from envhub_worker.extras.access import keys
+from envhub_worker.extras.access.commands import http_port, identity, listen, listen_options
+from envhub_worker.extras.access.keys import AuthorizedClients
+from envhub_worker.extras.access.quotas import Quotas
 from envhub_worker.protocol.keys import key_text, parse_key
 from tests.support import inside
 

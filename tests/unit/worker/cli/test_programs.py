@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from envhub_worker.__main__ import main
-from envhub_worker.cli import drain, keygen, status
+from envhub_worker.extras.access.commands import drain, keygen, status
 from envhub_worker.protocol.keys import key_text, parse_key
 
 

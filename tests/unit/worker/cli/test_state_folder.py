@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.cli import state_folder, status
-from envhub_worker.cli.state_folder import Note, ServerNote
+from envhub_worker.extras.access.commands import state_folder, status
+from envhub_worker.extras.access.commands.state_folder import Note, ServerNote
 
 A = ServerNote("tcp://127.0.0.1:1", "insecure", "/a key")
 B = ServerNote("tcp://127.0.0.1:2", "insecure", "/b")
@@ -19,7 +19,7 @@ B = ServerNote("tcp://127.0.0.1:2", "insecure", "/b")
 _WRITER = """
 import os, signal, sys
 from pathlib import Path
-from envhub_worker.cli.state_folder import Note, ServerNote
+from envhub_worker.extras.access.commands.state_folder import Note, ServerNote
 Note(Path(sys.argv[1]), ServerNote("tcp://127.0.0.1:1", "insecure", "/a"))
 os.kill(os.getpid(), signal.SIGKILL)
 """

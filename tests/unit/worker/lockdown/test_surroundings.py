@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.cli import health
+from envhub_worker.extras.access.commands import health
 from envhub_worker.lockdown import probe
 from envhub_worker.protocol.confinement import Surroundings
 from envhub_worker.protocol.runtime import OWN, Runtime

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from envhub_worker.runner import old_gym
+from envhub_worker.extras import old_gym
 from envhub_worker.runner.tasks import ResultError, tasks_of
 
 OBSERVATION = np.zeros(2, np.float32)

@@ -1,1 +1,1 @@
-"""Unit tests of ``envhub_sandbox/check/play``."""
+"""Unit tests of ``envhub_sandbox/extras/judge/play``."""

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from envhub_sandbox.check.play.episodes import (
+from envhub_sandbox.play.episodes import (
     MAX_COMPONENTS,
     EpisodeCounter,
     RolloutError,

@@ -9,9 +9,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envhub_sandbox.check.play import plays, traces
-from envhub_sandbox.check.play.plays import Play, facts_of, film
 from envhub_sandbox.errors import RemoteEnvError
+from envhub_sandbox.extras.judge.play import traces
+from envhub_sandbox.play import plays
+from envhub_sandbox.play.plays import Play, facts_of, film
 
 pytest.importorskip("imageio_ffmpeg")
 Modes = gym.vector.AutoresetMode

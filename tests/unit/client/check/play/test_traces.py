@@ -13,8 +13,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from envhub_sandbox.check.play.members import OutsideSpaceError, check_observations, holds
-from envhub_sandbox.check.play.traces import Trace, digest, play
+from envhub_sandbox.extras.judge.play.members import OutsideSpaceError, check_observations, holds
+from envhub_sandbox.extras.judge.play.traces import Trace, digest, play
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace
 from tests.support import inside
 

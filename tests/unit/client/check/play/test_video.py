@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from envhub_sandbox.check.play.plays import (
+from envhub_sandbox.errors import RemoteEnvError, VideoError
+from envhub_sandbox.play.plays import (
     MAX_SIDE,
     check_target,
     first_frame,
@@ -20,7 +21,6 @@ from envhub_sandbox.check.play.plays import (
     frame_of,
     video_writer,
 )
-from envhub_sandbox.errors import RemoteEnvError, VideoError
 from envhub_sandbox.vector.pictures import png, small_picture
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies.builds import download, project
 from envhub_sandbox.errors import DependencyError
-from envhub_sandbox.hub.git import address, commits
+from envhub_sandbox.extras.packages.builds import download, project
+from envhub_sandbox.extras.sources import git_address as address
+from envhub_sandbox.extras.sources import git_commits as commits
 from envhub_sandbox.hub.logins import authorization
 from tests.support.packages.git_server import commit, git_served, make_repository
 from tests.support.packages.git_server import git as run_git

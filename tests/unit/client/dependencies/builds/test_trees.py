@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies.builds import trees
 from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.extras.packages.builds import trees
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.sdists import add, make_sdist
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.builds import wheels
-from envhub_sandbox.dependencies.declared import Source
-from envhub_sandbox.dependencies.interpreters import Interpreter
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.builds import wheels
+from envhub_sandbox.extras.packages.declared import Source
+from envhub_sandbox.extras.packages.interpreters import Interpreter
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import make_wheel
 

@@ -1,1 +1,1 @@
-"""Unit tests of ``envhub_sandbox/sandboxes/docker``."""
+"""Unit tests of ``envhub_sandbox/extras/docker``."""

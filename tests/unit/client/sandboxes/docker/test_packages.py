@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import pytest
 
-from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.declared import parse_requirement
-from envhub_sandbox.dependencies.interpreters import InstalledPackage
-from envhub_sandbox.dependencies.modules import Guess
-from envhub_sandbox.dependencies.request import PackageRequest
-from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError
-from envhub_sandbox.sandboxes.docker import packages
-from envhub_sandbox.sandboxes.docker.packages import interpreter_fitting
+from envhub_sandbox.extras.docker import packages
+from envhub_sandbox.extras.docker.packages import interpreter_fitting
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.declared import parse_requirement
+from envhub_sandbox.extras.packages.interpreters import InstalledPackage
+from envhub_sandbox.extras.packages.modules import Guess
+from envhub_sandbox.extras.packages.request import PackageRequest
+from envhub_sandbox.extras.packages.resolution.resolve import Lock
 from tests.support.packages.refusals import refused_dependency
 
 OURS = interpreters.own()

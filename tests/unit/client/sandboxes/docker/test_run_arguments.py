@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.sandboxes.docker import attestation, engines, run_arguments
-from envhub_sandbox.sandboxes.docker.container import ContainerServer
-from envhub_sandbox.sandboxes.docker.engines import Engine
-from envhub_sandbox.sandboxes.docker.run_arguments import Container
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.extras.docker import attestation, engines, run_arguments
+from envhub_sandbox.extras.docker.container import ContainerServer
+from envhub_sandbox.extras.docker.engines import Engine
+from envhub_sandbox.extras.docker.run_arguments import Container
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 from envhub_sandbox.settings.policy import Limits, Policy
 from envhub_worker.lockdown.seccomp import policy as seccomp_policy
 from envhub_worker.protocol.confinement import Surroundings

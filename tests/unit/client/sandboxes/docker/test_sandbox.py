@@ -21,12 +21,12 @@ from envhub_sandbox.errors import (
     SandboxUnavailableError,
     WorkerStartupError,
 )
-from envhub_sandbox.sandboxes.docker import attestation, engines, published, run_arguments
-from envhub_sandbox.sandboxes.docker.container import RepositoryContainer
-from envhub_sandbox.sandboxes.docker.engines import Engine
-from envhub_sandbox.sandboxes.docker.packages import BuiltImageTarget, ImageTarget
-from envhub_sandbox.sandboxes.docker.published import PublishedContainer
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.extras.docker import attestation, engines, published, run_arguments
+from envhub_sandbox.extras.docker.container import RepositoryContainer
+from envhub_sandbox.extras.docker.engines import Engine
+from envhub_sandbox.extras.docker.packages import BuiltImageTarget, ImageTarget
+from envhub_sandbox.extras.docker.published import PublishedContainer
+from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m

@@ -1,1 +1,1 @@
-"""Unit tests of ``envhub_worker/access/store``."""
+"""Unit tests of ``envhub_worker/extras/access/store``."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.access.store.blob_store import BLOCK_BYTES, BlobStore, ListedFile
+from envhub_worker.extras.access.store.blob_store import BLOCK_BYTES, BlobStore, ListedFile
 from envhub_worker.supervisor.records import RefusedError
 
 

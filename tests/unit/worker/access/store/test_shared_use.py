@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.access.quotas import Quotas
-from envhub_worker.access.store.blob_store import SharedUse
-from envhub_worker.access.store.uploads import Uploads
+from envhub_worker.extras.access.quotas import Quotas
+from envhub_worker.extras.access.store.blob_store import SharedUse
+from envhub_worker.extras.access.store.uploads import Uploads
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
 

@@ -1,0 +1,142 @@
+"""Asks an environment again what was asked of one that died, and says whether this one does too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from envhub_sandbox.errors import ActionError, RemoteEnvError, WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.extras.crash.bundle_reader import Bundle
+from envhub_sandbox.extras.crash.bundle_writer import death_of
+from envhub_worker.protocol import messages as m
+
+_SHOWN = 64
+_UNFIT = (ActionError, TypeError, ValueError)
+"""What another environment than it was raises before it is asked."""
+
+
+class Verdict(str, Enum):
+    """How a replay ended."""
+
+    SAME = "same"
+    DIFFERENT = "different"
+    SURVIVED = "survived"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayResult:
+    """What a replay did.
+
+    Attributes:
+        requests: Requests of the bundle that were asked, the last one included.
+        steps: Steps among them.
+        death: What ended it: ``reason``, ``exit_code``, ``signal``, ``message``; None if nothing.
+        note: What else there is to say, or "".
+    """
+
+    verdict: Verdict
+    requests: int
+    steps: int
+    death: dict[str, Any] | None = None
+    note: str = ""
+
+
+def replay(make: Callable[[], Any], bundle: Bundle) -> ReplayResult:
+    """Make the environment, which may raise as ``make_env``, and repeat a bundle's requests."""
+    try:
+        env = make()
+    except (WorkerDiedError, WorkerTimeoutError) as error:
+        return _ended(error, bundle, 0, 0)
+    if env is None:
+        return ReplayResult(verdict=Verdict.SURVIVED, requests=0, steps=0)
+    steps = 0
+    for done, message in enumerate(bundle.requests(), start=1):
+        steps += isinstance(message, m.Step)
+        try:
+            ended = _ask(env, message)
+        except _UNFIT as error:
+            note = f"request {done} does not fit this environment: {error}"
+            return ReplayResult(verdict=Verdict.DIFFERENT, requests=done, steps=steps, note=note)
+        if ended is not None:
+            return _ended(ended, bundle, done, steps)
+    return ReplayResult(verdict=Verdict.SURVIVED, requests=bundle.count, steps=steps)
+
+
+def _ask(env: Any, message: m.Message) -> WorkerDiedError | WorkerTimeoutError | None:
+    """Repeat one request; what the repository raises is its answer, as it was before."""
+    repeat = _REPEATED.get(type(message))  # none for what no history has
+    try:
+        if repeat is not None:
+            repeat(env, message)
+    except (WorkerDiedError, WorkerTimeoutError) as error:
+        return error
+    except (RemoteEnvError, AttributeError):
+        pass
+    return None
+
+
+def _ended(
+    error: WorkerDiedError | WorkerTimeoutError, bundle: Bundle, requests: int, steps: int
+) -> ReplayResult:
+    death = death_of(error)
+    how = {name: death[name] for name in ("reason", "exit_code", "signal")}
+    same = requests == bundle.count and all(how[name] == bundle.death[name] for name in how)
+    return ReplayResult(
+        verdict=Verdict.SAME if same else Verdict.DIFFERENT,
+        requests=requests,
+        steps=steps,
+        death={**how, "message": death["message"]},
+    )
+
+
+def _reset(env: Any, message: m.Reset) -> None:
+    options = message.options if isinstance(message.options, dict) else None
+    if message.mask is not None:
+        options = {**(options or {}), "reset_mask": message.mask}
+    env.reset(seed=message.seeds, options=options)
+
+
+def _set_random(env: Any, message: m.SetRandom) -> None:
+    env._generators.write(message.states, new=message.new)
+
+
+def _ask_own(env: Any, message: m.GetOwn | m.CallOwn) -> None:
+    """Ask about the repository's vector environment itself: no name is looked up in the proxy."""
+    call = (message.args, message.kwargs) if isinstance(message, m.CallOwn) else ()
+    operation = f"env.{message.name[:_SHOWN]}"  # which is no reset or step of all
+    env._requests.ask_own(operation, type(message), message.name, *call)
+
+
+def _ask_one(env: Any, message: m.GetOne | m.CallOne) -> None:
+    """Ask about one sub-environment, likewise; other shards are sent no arguments."""
+
+    def message_for(number: int, index: int | None) -> m.Message:
+        changes: dict[str, Any] = {"env": number, "index": index}
+        if index is None and isinstance(message, m.CallOne):
+            changes |= {"args": (), "kwargs": {}}
+        return m.replace(message, **changes)
+
+    if message.index is not None and 0 <= message.index < env.num_envs:
+        env._requests.ask_one(message.name, message.index, message_for)
+
+
+_REPEATED: dict[type[m.Message], Callable[[Any, Any], object]] = {
+    m.Reset: _reset,
+    m.Step: lambda env, message: env.step(message.actions),
+    m.Call: lambda env, message: env.call(message.name, *message.args, **message.kwargs),
+    m.SetAttr: lambda env, message: env.set_attr(message.name, list(message.values)),
+    m.Render: lambda env, message: env.render(),
+    m.CallOwn: _ask_own,
+    m.GetOwn: _ask_own,
+    m.CallOne: _ask_one,
+    m.GetOne: _ask_one,
+    m.GetRandom: lambda env, message: env.np_random,
+    m.SetRandom: _set_random,
+}
+
+
+def changed_files(recorded: dict[str, str], found: dict[str, str]) -> Sequence[str]:
+    """The paths of files that were changed, added or removed since."""
+    return sorted(path for path in {*recorded, *found} if recorded.get(path) != found.get(path))

@@ -1,0 +1,134 @@
+"""What a container's server says of its surroundings, against what was asked for. Pure.
+
+Trust: the server is our code, in an image that the caller chose. What it says is bounded and
+typed here all the same, and whatever does not hold ends the matter.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from envhub_sandbox.errors import (
+    RemoteProtocolError,
+    SandboxUnavailableError,
+    WorkerStartupError,
+)
+from envhub_sandbox.extras.docker.run_arguments import Container
+from envhub_sandbox.settings.options import option_name
+from envhub_worker.protocol.confinement import Surroundings
+from envhub_worker.protocol.errors import UNTRUSTED
+
+_MIB = 1024 * 1024
+_NATIVE_RUNTIMES = (None, "runc", "crun", "io.containerd.runc.v2")
+
+
+def parse(line: bytes) -> Surroundings:
+    """The server's announcement. Raises ``WorkerStartupError``: it is something else."""
+    try:
+        with UNTRUSTED:
+            return Surroundings.read(json.loads(line))
+    except RemoteProtocolError as error:
+        raise WorkerStartupError(
+            "the image has another version of envhub-worker; build it again"
+        ) from error
+
+
+def profile_for(wanted: str, found: Surroundings) -> str:
+    """The profile of jails in a container where the policy names ``wanted``.
+
+    The container's own walls stand around every jail. So ``"strict"`` takes the strongest that can
+    be had in there, as long as something keeps a jail from the server next to it: namespaces, or
+    Landlock. The weaker profiles are taken at their word.
+    Raises ``SandboxUnavailableError``: it cannot be had.
+    """
+    if wanted != "strict":
+        if wanted in found.profiles:
+            return wanted
+        raise SandboxUnavailableError(
+            f"the profile {wanted!r} cannot be had in this container; it can give "
+            f"{', '.join(found.profiles) or 'none'}"
+        )
+    if "strict" in found.profiles:
+        return "strict"
+    if "container" in found.profiles and found.landlock >= 1:
+        return "container"
+    raise SandboxUnavailableError(
+        "this container permits neither namespaces nor Landlock, so only a system call filter "
+        "would separate the repository from the server that runs it. If the container's own "
+        f"confinement is enough, use {option_name('profile', 'container')}."
+    )
+
+
+def layers(wanted: Container, found: Surroundings, title: str) -> list[dict[str, Any]]:
+    """What holds around every jail, for the report.
+    ``title``: engine and image, for the first line.
+    Raises ``SandboxUnavailableError``: something that was asked for does not hold.
+    """
+    checks: Sequence[tuple[str, bool, str]] = (
+        ("container-user", found.user == wanted.user[0] != 0, f"user {found.user}, not root"),
+        ("container-capabilities", found.capabilities == 0, "none in any set"),
+        ("container-privileges", found.no_new_privileges, "no new ones can be gained"),
+        ("container-files", found.read_only, "a read-only root, the snapshot, and scratch"),
+        *_chosen(wanted, found),
+    )
+    for layer, holds, _ in checks:
+        if not holds:
+            raise _does_not_hold(layer, wanted, found)
+    report = [{"layer": "container", "enforced": True, "detail": title}]
+    report += [{"layer": name, "enforced": True, "detail": detail} for name, _, detail in checks]
+    return [*report, *_absent(wanted)]
+
+
+def _chosen(wanted: Container, found: Surroundings) -> Iterator[tuple[str, bool, str]]:
+    """What is asked for by some containers only."""
+    if wanted.network == "none" and not wanted.only_client:
+        own = set(found.devices) <= {"lo"}
+        yield "container-network", own, "no device but its own loopback"
+    if wanted.runtime in _NATIVE_RUNTIMES:  # else another kernel than the host's answers
+        yield "container-seccomp", found.seccomp, "an allow-list around the jail's own"
+    for name, most, has in (
+        ("memory", wanted.memory, found.memory),
+        ("pids", wanted.pids, found.pids),
+        ("cpus", wanted.cpus, found.cpus),
+    ):
+        if most is not None:
+            holds = has is not None and has <= most * 1.01
+            yield f"container-{name}", holds, _amount(name, most)
+
+
+def _amount(name: str, most: float) -> str:
+    amounts = {
+        "memory": f"{most / _MIB:.0f} MiB for all jails and the server",
+        "pids": f"{most:.0f} processes and threads",
+        "cpus": f"the time of {most:g} processors",
+    }
+    return amounts[name]
+
+
+def _absent(wanted: Container) -> list[dict[str, Any]]:
+    """What the caller has gone without."""
+    missing = []
+    if wanted.only_client:
+        who = "jails have none of it" if wanted.network == "none" else "and jails, by choice"
+        bridge = f"a bridge, for the port that is published on loopback; {who}"
+        missing.append(("container-network", bridge))
+    elif wanted.network != "none":
+        missing.append(("container-network", "the host's network, by explicit choice"))
+    if wanted.runtime not in _NATIVE_RUNTIMES:
+        missing.append(("container-seccomp", f"the runtime {wanted.runtime} has rules of its own"))
+    if wanted.memory is None:
+        missing.append(("container-memory", "without control groups, by explicit choice"))
+    return [{"layer": name, "enforced": False, "detail": detail} for name, detail in missing]
+
+
+def _does_not_hold(layer: str, wanted: Container, found: Surroundings) -> SandboxUnavailableError:
+    what = f"the engine started the container, but {layer} does not hold in it"
+    if layer in ("container-memory", "container-pids", "container-cpus"):
+        return SandboxUnavailableError(
+            f"{what}: this host's control groups do not permit that limit. Enable them, or use no "
+            "limits of the container: DockerSandbox(cgroups=False). Each jail still has its own "
+            "limits."
+        )
+    return SandboxUnavailableError(f"{what}: {found}, wanted {wanted.user}. Nothing was run.")

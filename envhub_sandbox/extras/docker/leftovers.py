@@ -1,0 +1,152 @@
+"""What clients that were killed left behind: containers, folders, control groups.
+
+Only what is certainly ours and not in use any more. A process that lives holds a lock: a client
+that of its folder, which its container names in a label, and a server those of its folders and
+control groups. What has no such lock is left alone. So is what belongs to another user, whose files
+we may not even see; root sees all, and removes every user's containers and control groups.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.extras.docker.engines import (
+    ENGINES,
+    Engine,
+    EngineError,
+    find_engine,
+    is_elsewhere,
+)
+from envhub_sandbox.extras.docker.run_arguments import FOLDER_LABEL, USER_LABEL
+from envhub_sandbox.sandboxes.process import is_in_use, places, stale_folders
+from envhub_sandbox.system.locks import is_held, unheld
+from envhub_sandbox.system.platform import user_id
+
+_CGROUPS = Path("/sys/fs/cgroup")
+_ENDED = frozenset({"exited", "stopped", "dead"})
+_GROUP = re.compile(r"envhub_\d+_\w[\w-]*")
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """One thing that is not in use any more.
+
+    Attributes:
+        kind: ``"container"``, ``"folder"`` or ``"control group"``.
+        name: A container's name, or a path.
+    """
+
+    kind: str
+    name: str
+    engine: Engine | None = None
+
+    def remove(self) -> bool:
+        """Remove it; whether it is gone."""
+        if self.engine is not None:
+            with contextlib.suppress(EngineError):
+                self.engine.run("rm", "--force", "--volumes", self.name)
+                return True
+            return False
+        if self.kind == "folder":
+            shutil.rmtree(self.name, ignore_errors=True)
+            return not os.path.exists(self.name)
+        return _remove_groups(Path(self.name))
+
+
+class Found(NamedTuple):
+    """What a search found.
+
+    Attributes:
+        leftovers: Everything that can be removed.
+        unasked: The engines that are installed and could not be asked, with the reason.
+    """
+
+    leftovers: list[Leftover]
+    unasked: dict[str, str]
+
+
+def find() -> Found:
+    """Look everywhere. Removes nothing."""
+    containers, unasked = _containers()
+    folders = [Leftover("folder", str(path)) for place in places() for path in stale_folders(place)]
+    return Found([*containers, *folders, *stale_groups(_CGROUPS)], unasked)
+
+
+def _containers() -> tuple[list[Leftover], dict[str, str]]:
+    """Those of every engine that answers, and why others do not; a machine need not have any."""
+    found: dict[str, list[Leftover]] = {}
+    unasked = {}
+    for name in ENGINES:
+        try:
+            engine = find_engine(name)
+            if engine.kind not in found:
+                found[engine.kind] = list(stale_containers(engine))
+        except (SandboxUnavailableError, EngineError) as error:
+            if shutil.which(name) and not is_elsewhere(name):
+                unasked[name] = str(error)
+    return [one for some in found.values() for one in some], unasked
+
+
+def stale_containers(engine: Engine) -> Iterator[Leftover]:
+    """Containers of ours whose client has ended, running or not.
+
+    One that runs for a client of another machine, whose folder is not here, is left alone.
+    """
+    listed = engine.run(
+        "ps", "--all", "--no-trunc", "--filter", f"label={FOLDER_LABEL}", "--format", "{{.ID}}"
+    )
+    for container in listed.split():
+        with contextlib.suppress(EngineError, ValueError):  # it may have gone meanwhile
+            said = json.loads(engine.run("inspect", container))[0]
+            labels = said["Config"]["Labels"]
+            if _is_mine(labels.get(USER_LABEL)) and _is_deserted_container(said):
+                yield Leftover("container", said["Name"].lstrip("/"), engine)
+
+
+def _is_deserted_container(said: dict[str, Any]) -> bool:
+    folder = Path(said["Config"]["Labels"][FOLDER_LABEL])
+    try:
+        return not is_in_use(folder)
+    except FileNotFoundError:
+        # an engine may be another machine's: its clients run there, or on a third one
+        return said["State"]["Status"] in _ENDED
+    except OSError:
+        return False
+
+
+def _is_mine(user: str | None) -> bool:
+    return user_id() == 0 or user == str(user_id())
+
+
+def stale_groups(root: Path) -> Iterator[Leftover]:
+    """Control groups of servers that have ended; the kernel keeps those with processes in them."""
+    folders = {path for level in ("", "*/", "*/*/") for path in root.glob(f"{level}envhub_*")}
+    for folder in sorted(folders):
+        with contextlib.suppress(OSError):
+            if _GROUP.fullmatch(folder.name) and _is_deserted_group(folder):
+                yield Leftover("control group", str(folder))
+
+
+def _is_deserted_group(folder: Path) -> bool:
+    processes = folder / "cgroup.procs"
+    used = processes.exists() and processes.read_text()
+    return not used and os.access(folder, os.W_OK) and not is_held(folder)
+
+
+def _remove_groups(folder: Path) -> bool:
+    # a server that has just made it takes the lock next, and makes another if it is gone
+    with contextlib.suppress(OSError), unheld(folder) as free:
+        for inner in [path for path in folder.iterdir() if free and path.is_dir()]:
+            inner.rmdir()
+        if free:
+            folder.rmdir()
+    return not folder.exists()

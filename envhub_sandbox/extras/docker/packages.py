@@ -1,0 +1,306 @@
+"""A repository's packages for a container: made here and mounted there, or in an image of its own.
+
+The folder is the one that a jail of this machine would be shown. So an interpreter of this machine
+has to be of the kind of the image's, and no wheel may need a newer glibc than the image has.
+
+In a derived image the server's interpreter stays as it is. The repository's packages go into
+``/opt/environment``, where the worker looks for the interpreter of its jails, and whatever would
+run at the start of every interpreter is left out of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+from envhub_sandbox.errors import (
+    DependencyError,
+    SandboxUnavailableError,
+)
+from envhub_sandbox.extras.docker.engines import (
+    Engine,
+    EngineError,
+    environment,
+    find_image,
+    own_limits,
+)
+from envhub_sandbox.extras.packages.declared import versions
+from envhub_sandbox.extras.packages.interpreters import (
+    InstalledPackage,
+    Interpreter,
+    find,
+    first_unmet,
+    release,
+)
+from envhub_sandbox.extras.packages.packages import HERE, PackageSet
+from envhub_sandbox.extras.packages.request import PackageRequest
+from envhub_sandbox.extras.packages.resolution.resolutions import versions_for
+from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target, resolve
+from envhub_sandbox.settings.options import option_name
+
+_INTERPRETER = "/opt/envhub-worker/bin/python"
+"""The server's, in every image."""
+# without site, so that nothing of what is installed there runs: its metadata is read
+_ASK = """
+import glob, json, os, platform, sys
+from importlib import metadata
+home = "/opt/environment" if os.path.exists("/opt/environment/bin/python") else "/opt/envhub-worker"
+found = metadata.distributions(path=glob.glob(home + "/lib/python3*/site-packages"))
+there = {one.metadata["Name"]: [one.version, one.requires or []] for one in found}
+facts = [sys.implementation.name, platform.python_version(), os.uname().machine]
+print(json.dumps([*facts, platform.libc_ver()[1], there]))
+"""
+
+
+class ImageTarget:
+    """The Python of an image. ``engine``: gives the engine, once there is something to ask it."""
+
+    def __init__(self, engine: Callable[[], Engine], image: str) -> None:
+        self._engine = engine
+        self._image = image
+
+    def _inside(self) -> tuple[Interpreter, dict[str, InstalledPackage]]:
+        engine = self._engine()
+        return image_packages(engine, find_image(engine, self._image))
+
+    def meets(self, request: PackageRequest) -> bool:
+        """Whether the image has all of it; raises as ``image_packages``."""
+        interpreter, there = self._inside()
+        names = set(map(canonicalize_name, there))
+        known = all(one.is_among(names) for one in request.guesses)
+        return known and first_unmet(request, there, interpreter.version) is None
+
+    def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
+        """An environment of this machine, to be mounted; its interpreter is the image's.
+        Raises ``DependencyError``: it cannot be made, or not for that image;
+        ``SandboxUnavailableError``: it is no image of ours.
+        """
+        ours = interpreter_fitting(self._inside()[0], request)
+        made = HERE.make(replace(request, python=ours.path), tell)
+        return replace(made, python="")
+
+
+@lru_cache(maxsize=16)
+def image_packages(engine: Engine, image: str) -> tuple[Interpreter, dict[str, InstalledPackage]]:
+    """The interpreter of an image, and what is installed for its jails; by the image's id.
+    Raises ``SandboxUnavailableError``: it is none of ours.
+    """
+    try:
+        said = engine.run(
+            *("run", "--rm", "--no-healthcheck", "--network", "none", "--read-only"),
+            *("--cap-drop", "ALL", "--security-opt", "no-new-privileges", "--pull", "never"),
+            *(word for limit in own_limits(engine) for word in ("--ulimit", limit)),
+            *("--entrypoint", _INTERPRETER, image, "-I", "-S", "-c", _ASK),
+        )
+        implementation, version, machine, libc, there = json.loads(said)
+        installed = {
+            str(name): InstalledPackage(str(version), tuple(map(str, requires)))
+            for name, (version, requires) in there.items()
+        }
+    except (EngineError, ValueError, TypeError, AttributeError) as error:
+        raise SandboxUnavailableError(
+            f"{image!r} is not an image of envhub-worker: {error}"
+        ) from error
+    facts = (str(implementation), release(str(version)), str(machine), str(libc))
+    return Interpreter(_INTERPRETER, *facts), installed
+
+
+def interpreter_fitting(theirs: Interpreter, request: PackageRequest) -> Interpreter:
+    """An interpreter of this machine whose packages the image's can import.
+    Raises ``DependencyError``: there is none.
+    """
+    asked = SpecifierSet(request.supports)
+    if not theirs.fits(asked) or (request.python and not _is_asked(theirs, request.python)):
+        wanted = request.python or str(asked)
+        raise DependencyError(
+            f"it needs Python {wanted}, and the image has {theirs.version}: build envhub-worker "
+            "from another base (docs/deployment.md)",
+            reason="interpreter",
+        )
+    minor = ".".join(theirs.version.split(".")[:2])
+    try:
+        ours = find(minor)
+    except DependencyError as error:
+        if error.reason != "interpreter":
+            raise
+        raise DependencyError(
+            f"packages for the image's Python {minor} need the same Python on this machine, which "
+            f"does not have it. {_remedy()}",
+            reason="interpreter",
+        ) from error
+    alike = (ours.implementation, ours.machine) == (theirs.implementation, theirs.machine)
+    if not alike or not ours.libc or not theirs.libc or Version(ours.libc) > Version(theirs.libc):
+        raise DependencyError(
+            f"packages of this machine ({ours.machine}, glibc {ours.libc or 'unknown'}) cannot be "
+            f"used in the image ({theirs.machine}, glibc {theirs.libc or 'unknown'}). {_remedy()}",
+            reason="interpreter",
+        )
+    return ours
+
+
+def _is_asked(theirs: Interpreter, asked: str) -> bool:
+    return "/" not in asked and theirs.fits(versions(asked))
+
+
+def _remedy() -> str:
+    return (
+        "Build an image with its packages (envhub image build REF, then "
+        f"{option_name('sandbox', 'docker:IMAGE')}), or use the image's packages with "
+        f"{option_name('dependencies', 'host')}"
+    )
+
+
+LOCK_LABEL = "dev.envhub.lock"
+_PACKAGE = re.compile(r"[a-z0-9][a-z0-9.+-]+")
+
+# An interpreter runs these at its start, before anything could confine it.
+_STARTERS = "-name '*.pth' -o -name 'sitecustomize*' -o -name 'usercustomize*'"
+_TEMPLATE = """\
+FROM {base}
+USER root
+{system}RUN python3 -m venv /opt/environment
+COPY requirements.lock /opt/environment/
+RUN /opt/environment/bin/python -m pip install --no-cache-dir --no-deps --require-hashes \\
+        --only-binary :all: -r /opt/environment/requirements.lock \\
+    && find /opt/environment/lib -mindepth 3 -maxdepth 3 \\( {starters} \\) -exec rm -r {{}} + \\
+    && chmod -R u=rwX,go=rX /opt/environment
+LABEL {lock_label}={digest}
+USER 65532:65532
+"""
+
+
+def target_of(engine: Engine, image: str) -> Target:
+    """What runs in a worker's image; raises as ``image_packages``."""
+    found, _ = image_packages(engine, image)
+    return Target(version=".".join(found.version.split(".")[:2]), machine=found.machine)
+
+
+def tag_for(repository: str, base: str, lock: Lock, system: Sequence[str]) -> str:
+    """The derived image's name: the repository's, and the hash of all that it is made of."""
+    slug = re.sub(r"[^a-z0-9]+", "-", repository.lower()).strip("-")[-60:] or "local"
+    made_of = "\n".join([base, lock.text, _TEMPLATE, *system])
+    return f"envhub-worker-{slug}:{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
+
+
+def dockerfile(base: str, lock: Lock, system: Sequence[str]) -> str:
+    """The derived image's recipe.
+    ``system``: Debian packages, for the libraries that some wheels need.
+    Raises ``DependencyError``: one of these is no name of a package.
+    """
+    for name in system:
+        if not _PACKAGE.fullmatch(name):
+            raise DependencyError(f"{name!r} is not the name of a Debian package")
+    install = ""
+    if system:
+        install = (
+            "RUN apt-get update && apt-get install -y --no-install-recommends "
+            f"{' '.join(system)} && rm -rf /var/lib/apt/lists/*\n"
+        )
+    return _TEMPLATE.format(
+        base=base, system=install, starters=_STARTERS, lock_label=LOCK_LABEL, digest=lock.digest
+    )
+
+
+class DerivedImage(NamedTuple):
+    """An image with a repository's packages: its name, whether it was made just now, its packages,
+    and the modules for which some were taken that nothing declares.
+    """
+
+    tag: str
+    is_new: bool
+    lock: Lock
+    taken: tuple[str, ...]
+
+
+def derived(
+    engine: Engine,
+    base: str,
+    request: PackageRequest,
+    *,
+    name: str = "packages",
+    system: Sequence[str] = (),
+    network: str | None = None,
+    tell: Callable[[str], None] = lambda line: None,
+) -> DerivedImage:
+    """The image for what a repository is to have, built unless the engine has it.
+
+    Args:
+        name: The repository's, for people.
+        system: Debian packages that it needs, too.
+        network: That of the build, as engines call it.
+
+    Raises ``DependencyError``: it cannot be made; the text says what to change;
+    ``SandboxUnavailableError``: the base is no image of ours, or is not there.
+    """
+    identity, target = find_image(engine, base), target_of(engine, base)
+    _check_python(request, target)
+    tell(f"choosing versions for {request.source}")
+    lock, guesses = versions_for(request, lambda asked: resolve(asked, target, tell=tell))
+    tag = tag_for(name, identity, lock, system)
+    is_new = not exists(engine, tag)
+    if is_new:
+        tell(f"building the image {tag}")
+        build(engine, dockerfile(base, lock, system), lock, tag, network)
+    return DerivedImage(tag, is_new, lock, tuple(one.module for one in guesses))
+
+
+def _check_python(request: PackageRequest, target: Target) -> None:
+    asked = versions(request.python) & SpecifierSet(request.supports)
+    if os.sep in request.python or not asked.contains(f"{target.version}.99"):
+        raise DependencyError(
+            f"{request.source} asks for Python {request.python or request.supports}, and the image "
+            f"has {target.version}: build envhub-worker from another base (docs/deployment.md)",
+            reason="interpreter",
+        )
+
+
+class BuiltImageTarget(ImageTarget):
+    """The Python of an image, from which one with the packages is derived."""
+
+    def __init__(self, engine: Callable[[], Engine], image: str, network: str | None) -> None:
+        super().__init__(engine, image)
+        self._network = network
+
+    def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
+        """An image, whose name stands for its packages; raises as ``derived``."""
+        engine = self._engine()
+        made = derived(engine, self._image, request, network=self._network, tell=tell)
+        facts = {"lock": f"sha256:{made.lock.digest}", "packages": made.lock.packages}
+        inferred = [one.facts for one in request.guesses if one.module in made.taken]
+        return PackageSet(made.tag, facts | ({"inferred": inferred} if inferred else {}))
+
+
+def build(engine: Engine, recipe: str, lock: Lock, tag: str, network: str | None) -> None:
+    """Build the image; what the engine says goes to stderr. Raises ``DependencyError``."""
+    with tempfile.TemporaryDirectory(prefix="envhub-image-") as folder:
+        (Path(folder) / "Dockerfile").write_bytes(recipe.encode())
+        (Path(folder) / "requirements.lock").write_bytes(lock.text.encode())
+        command = [engine.command, "build", "--tag", tag]
+        command += [] if network is None else ["--network", network]
+        done = subprocess.run(
+            [*command, folder], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment()
+        )
+    if done.returncode != 0:
+        said = done.stdout.decode(errors="replace")[-4000:]
+        raise DependencyError(f"{engine.kind} could not build {tag}:\n{said}")
+
+
+def exists(engine: Engine, tag: str) -> bool:
+    """Whether the engine has an image."""
+    with contextlib.suppress(EngineError):
+        return bool(engine.run("image", "inspect", "--format", "{{.Id}}", tag))
+    return False

@@ -1,0 +1,120 @@
+"""``sandbox="docker"``: the worker in a container of its own for each repository.
+
+The container has no network, a read-only root, no capability, limits, and three things from
+outside: the repository's files, scratch in memory, and a folder of mode 0700 with two sockets,
+over which messages and the fast lane's descriptors travel. Inside, the worker locks each jail
+down as it does on a host. What holds is read from inside before anything runs; see
+``docs/deployment.md``. Where the engine runs in a virtual machine, see ``published.py``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
+from envhub_sandbox.extras.docker import run_arguments
+from envhub_sandbox.extras.docker.container import ContainerOptions, RepositoryContainer
+from envhub_sandbox.extras.docker.engines import Engine, find_engine, find_image
+from envhub_sandbox.extras.docker.packages import BuiltImageTarget, ImageTarget
+from envhub_sandbox.extras.docker.published import PublishedContainer
+from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.settings.policy import Policy
+from envhub_sandbox.system.platform import IS_LINUX, NAME
+from envhub_worker.protocol.runtime import Runtime
+
+
+@dataclass(kw_only=True)
+class DockerSandbox(ContainerOptions, Sandbox):
+    """Workers in containers. ``sandbox="docker"`` is this with its defaults.
+
+    Attributes:
+        image: The image: ``docker build -t envhub-worker .``, or one that is derived from it.
+        engine: ``"docker"`` or ``"podman"``; by default docker, if it answers, else podman.
+        runtime: The engine's runtime, such as ``"runsc"``.
+        gpus: What ``--gpus`` takes; ``"all"`` where the policy grants the GPU.
+        memory: Bytes for all jails of a repository and the server; by default the policy's limit
+            and 1 GiB.
+        pids: Processes and threads likewise; by default the policy's limit and 256.
+        cpus: Processors' worth of time; by default as many as this process may use.
+        cgroups: False goes without these three, where an engine cannot limit them.
+        published: Publish a port on loopback, and mount no file of this machine: for an engine in a
+            virtual machine. True by default on macOS and Windows.
+        build_network: With ``published``, the engine's name of the network for building images with
+            a repository's packages.
+    """
+
+    published: bool = not IS_LINUX
+    build_network: str | None = None
+    name = "docker"
+
+    def __post_init__(self) -> None:
+        for option in ("memory", "pids", "cpus"):
+            value = getattr(self, option)
+            if value is not None and not value > 0:
+                raise PolicyError(f"DockerSandbox: {option} is {value!r}; it takes more than 0")
+
+    def for_repository(
+        self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
+    ) -> RepositoryContainer:
+        """The container for one repository. Starts nothing, but asks for engine and image.
+        Raises ``PolicyError``: a container cannot give what the policy permits;
+        ``SandboxUnavailableError``: there is no engine, no image, or no permission.
+        """
+        if runtime.python:
+            raise PolicyError(
+                f"{option_name('python', runtime.python)} is an interpreter of this machine, and "
+                "a container has its own: choose an image instead, with "
+                f"{option_name('sandbox', 'docker:IMAGE')}"
+            )
+        if self.gpus is not None and not policy.gpu:
+            raise PolicyError("DockerSandbox(gpus=...) takes a policy with gpu=True")
+        if not isinstance(policy.gpu, bool):
+            raise PolicyError(
+                f"gpu={list(policy.gpu)} are indices of this machine, and a container has its own: "
+                "use gpu=True, and choose with DockerSandbox(gpus='device=0')"
+            )
+        if self.published:
+            return self._published(snapshot, policy, runtime, assets)
+        if not IS_LINUX:
+            raise SandboxUnavailableError(
+                f"on {NAME} containers run in a virtual machine, which shares no memory with this "
+                "process: leave published=False out"
+            )
+        run_arguments.check_readable(policy.readable)
+        engine = find_engine(self.engine)
+        _check_users(engine)
+        image = find_image(engine, self.image)
+        return RepositoryContainer(self, engine, image, snapshot, policy, runtime.packages, assets)
+
+    def _published(
+        self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...]
+    ) -> RepositoryContainer:
+        if policy.readable:
+            raise PolicyError(
+                f"{option_name('readable', list(policy.readable))} are paths of this machine, and "
+                "a container in a virtual machine is shown the repository's files only: put what "
+                "is needed into the repository"
+            )
+        engine = find_engine(self.engine)
+        # what was made for the repository is an image
+        image = find_image(engine, runtime.packages or self.image)
+        return PublishedContainer(self, engine, image, snapshot, policy, assets=assets)
+
+    def package_target(self) -> ImageTarget:
+        """Packages are made for the image's Python: on this machine, or else as an image."""
+        engine = partial(find_engine, self.engine)
+        if self.published:
+            return BuiltImageTarget(engine, self.image, self.build_network)
+        return ImageTarget(engine, self.image)
+
+
+def _check_users(engine: Engine) -> None:
+    if engine.kind == "docker" and engine.rootless:
+        raise SandboxUnavailableError(
+            "with rootless Docker your user is root in a container, and the worker refuses to run "
+            "as root; use podman (DockerSandbox(engine='podman')), which keeps your id, or the "
+            "engine of the system (DOCKER_HOST=unix:///var/run/docker.sock)"
+        )

@@ -1,0 +1,117 @@
+"""``sandbox=[...]`` and ``Fleet(...)``: the workers of one environment on many places."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.extras.fleet.member import FleetPackages
+from envhub_sandbox.extras.fleet.placement import Placement, Resolve, Seat
+from envhub_sandbox.extras.remote.sandbox import RemoteSandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox, is_list
+from envhub_worker.protocol.runtime import Runtime
+
+MOST_PLACES = 4096
+
+
+def places_of(source: str | Sequence[str | Sandbox]) -> list[str | Sandbox]:
+    """The places that are named: a list, or text with commas between them.
+    Raises ``PolicyError``: there are none, or too many.
+    """
+    if isinstance(source, str):
+        source = [word for word in map(str.strip, source.split(",")) if word]
+    places = list(source)
+    if not 0 < len(places) <= MOST_PLACES:
+        raise PolicyError(
+            f"a fleet names {len(places)} places; it takes 1 to {MOST_PLACES}, such as "
+            "['tcp://a:5555', 'tcp://b:5555']"
+        )
+    return places
+
+
+@dataclass(eq=False)
+class Fleet(Sandbox):
+    """Several places for the workers of one environment.
+
+    Results, seeds and their order are those of a single place, whatever the places and the number
+    of workers. See ``docs/scaling.md``.
+
+    Attributes:
+        places: A list of values that ``sandbox`` takes for one place; a place that is listed twice
+            gets twice as many workers. Or text, with commas between the places. An address may be
+            followed by its server's public key: ``"tcp://HOST:PORT KEY"``.
+        remote: Further arguments of ``RemoteSandbox`` for all places that are addresses.
+    """
+
+    places: str | Sequence[str | Sandbox]
+    remote: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    name = "fleet"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.places, Iterable):
+            raise PolicyError(
+                f"a fleet's places are {self.places!r}; they are a list, or text with commas"
+            )
+        known = {one.name for one in fields(RemoteSandbox) if one.init} - {"endpoint"}
+        if unknown := sorted(map(repr, set(self.remote) - known)):
+            raise PolicyError(
+                f"a fleet's remote has {', '.join(unknown)}; RemoteSandbox takes "
+                f"{', '.join(sorted(known))}"
+            )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """No secret key is in a pickle: see ``RemoteSandbox``."""
+        probe = RemoteSandbox("tcp://host:1", client_key=self.remote.get("client_key"))
+        key = probe.__getstate__()["client_key"]
+        return {**self.__dict__, "remote": {**self.remote, "client_key": key}}
+
+    def __copy__(self) -> Fleet:
+        return replace(self)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Fleet:
+        return replace(self)
+
+    def opened(self, resolve: Resolve) -> OpenFleet:
+        """The fleet of one ``make_env``.
+        ``resolve``: makes a sandbox of a name that is no address.
+        """
+
+        def sandbox_of(place: str | Sandbox) -> Sandbox:
+            if is_fleet(place):
+                raise PolicyError("a fleet's places are named one by one: no fleet is one")
+            if isinstance(place, str) and place.startswith("tcp://"):
+                return RemoteSandbox(place, **self.remote)
+            return resolve(place)
+
+        return OpenFleet(places_of(self.places), sandbox_of)
+
+
+def is_fleet(place: object) -> bool:
+    """Whether this names several places."""
+    return isinstance(place, (list, tuple, Fleet)) or (isinstance(place, str) and is_list(place))
+
+
+class OpenFleet(Sandbox):
+    """The fleet of one ``make_env``: its places, and what was made there for the repository."""
+
+    name = "fleet"
+
+    def __init__(self, places: Sequence[str | Sandbox], resolve: Resolve) -> None:
+        self._packages = FleetPackages()
+        self._placement = Placement(places, resolve, self._packages.runtime_of)
+        self._packages.members = self._placement.members
+        self.is_here = any(member.sandbox.is_here for member in self._placement.members())
+
+    def note_interpreter(self, runtime: Runtime) -> None:
+        """See ``Sandbox``."""
+        self._packages.host = runtime
+
+    def workers(self, num_workers: int | None) -> list[Seat]:
+        """A place for each worker: by default one worker on each."""
+        return self._placement.seats(num_workers)
+
+    def package_target(self) -> FleetPackages:
+        """See ``Sandbox``: each place has its own."""
+        return self._packages

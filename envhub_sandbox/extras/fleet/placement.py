@@ -1,0 +1,307 @@
+"""Which worker of a fleet goes where.
+
+A worker goes where the fewest workers of its fleet are, among the places that answer and have room;
+of several such, where there is most room by the word of its server, and then by the order of the
+list. It comes back where it was, if that place answers. A place that refuses it, or does not
+answer, is followed by the next: all are tried before a worker has none. Results never depend on it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from time import monotonic
+
+from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.extras.fleet.member import ForRepository, Member
+from envhub_sandbox.extras.remote import sandbox as remote
+from envhub_sandbox.extras.remote.sandbox import RemoteSandbox, ServerFacts
+from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
+from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.settings.policy import Policy
+from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.system.threads import Call, Calls
+from envhub_sandbox.transport.replies import UnreachableError
+from envhub_worker.protocol.runtime import OWN, Runtime
+
+_WAIT_S = 1.5
+"""How long servers may take to answer: one that takes longer comes after those that have."""
+_FRESH_S = 2.0
+"""For how long an answer holds, less what has been placed there since."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """The room of one place.
+
+    Attributes:
+        answers: Whether it has answered; true of a place that is not asked.
+        known_s: When it was asked.
+        workers: For how many more workers there is room; infinity where nothing bounds them.
+    """
+
+    answers: bool = True
+    workers: float = float("inf")
+    known_s: float = 0.0
+
+
+class Rooms:
+    """The rooms of a fleet's places. Thread-safe.
+    ``memory_bytes``: what a worker takes of its key's quota.
+    """
+
+    def __init__(self, memory_bytes: int) -> None:
+        self._memory_bytes = memory_bytes
+        self._asking = threading.RLock()  # interruption.md, rule 12
+        self._pending: dict[Member, tuple[float, Call[ServerFacts]]] = {}
+
+    def ask(self, members: Iterable[Member]) -> dict[Member, Room]:
+        """The room of each, asked of all at the same time; of one that is not a server its own."""
+        sandboxes = {one: one.sandbox for one in members}
+        servers = {m: one for m, one in sandboxes.items() if isinstance(one, RemoteSandbox)}
+        with self._asking:  # who comes next finds the answers
+            now = monotonic()
+            stale = [one for one in servers if self._is_stale(one, now)]
+            calls = [partial(remote.ask_facts, servers[one]) for one in stale]
+            asked = Calls(calls)
+            asked.wait(_WAIT_S)
+            self._pending.update({one: (now, p) for one, p in zip(stale, asked.each, strict=True)})
+            return {one: self._room(one) for one in servers}
+
+    def _is_stale(self, member: Member, now: float) -> bool:
+        at, pending = self._pending.get(member, (0.0, None))
+        # one that has not answered yet is still being asked
+        return pending is None or (pending.done and now - at > _FRESH_S)
+
+    def _room(self, member: Member) -> Room:
+        known_s, pending = self._pending[member]
+        facts = pending.value
+        if pending.error is not None and not isinstance(pending.error, UnreachableError):
+            text = "%s gets no worker as long as others have room: %s"
+            WORKER.warning(text, member.address, pending.error)
+        if facts is None:
+            return Room(answers=False, workers=0)
+        if facts.draining:
+            return Room(workers=0)
+        taken = {"jails": 1, "runners": 1, "memory_bytes": self._memory_bytes}
+        quotas, used = facts.quotas, facts.used
+        free = [(quotas[n] - used.get(n, 0)) // each for n, each in taken.items() if n in quotas]
+        return Room(workers=max(0, min(free, default=1)), known_s=known_s)
+
+
+_ASKED = 32
+"""Servers that are asked for their room at the same time."""
+ASK_S = 10.0
+"""For how long further servers are asked for the place of one worker, where none has room."""
+Resolve = Callable[["str | Sandbox"], Sandbox]
+
+
+def _key(entry: str | Sandbox) -> str | int:
+    """What identifies an entry of the list."""
+    return entry if isinstance(entry, str) else id(entry)
+
+
+class Placement:
+    """The places of the workers of one ``make_env``. Thread-safe.
+
+    Args:
+        places: As the caller names them.
+        resolve: Makes a sandbox of a place's name.
+        runtime: Makes what the jails of a place run on.
+    """
+
+    def __init__(
+        self,
+        places: Sequence[str | Sandbox],
+        resolve: Resolve,
+        runtime: Callable[[Member], Runtime],
+    ) -> None:
+        self._places = places
+        self._resolve = resolve
+        self._runtime = runtime
+        self._lock = threading.RLock()  # interruption.md, rule 12
+        self._members: list[Member] = []
+        self._at: dict[int, Member] = {}
+        self._placed_s: dict[int, float] = {}
+        self._repository: ForRepository | None = None
+        self._rooms: Rooms | None = None
+        self._run_by: tuple[list[Member], Runtime] | None = None
+
+    def members(self) -> list[Member]:
+        """The places, each once, with its weight. Raises ``EnvHubError``: one is none."""
+        with self._lock:
+            if not self._members:
+                named = {_key(entry): entry for entry in self._places}
+                members: list[Member] = []
+                for key, count in Counter(map(_key, self._places)).items():
+                    each = self._resolve(named[key]).workers(count)
+                    members += [Member(one, self._runtime, count // len(each)) for one in each]
+                self._members = members
+            return list(self._members)
+
+    def seats(self, num_workers: int | None) -> list[Seat]:
+        """One for each worker; by default as many as the list has places."""
+        count = num_workers or sum(member.weight for member in self.members())
+        return [Seat(self, number) for number in range(count)]
+
+    def open_for(self, repository: ForRepository, memory_bytes: int) -> None:
+        """Make the places of a repository.
+
+        One that is absent is made when a worker is to go there.
+        ``memory_bytes``: as of ``Rooms``.
+        """
+        with self._lock:
+            if self._repository is None:
+                members = self.members()
+                for member in [one for one in members if not one.absent] or members:
+                    member.open_for(repository)
+                self._rooms = Rooms(memory_bytes)
+                self._repository = repository
+
+    def runs_on(self, runtime: Runtime) -> Runtime:
+        """What runs it, on all places together."""
+        with self._lock:  # each of a thousand workers asks, and there may be a thousand places
+            members = self._open_ones()
+            if self._run_by is None or self._run_by[0] != members:
+                self._run_by = members, _all_together(one.runs_on(runtime) for one in members)
+            return self._run_by[1]
+
+    def retry_s(self) -> float:
+        """For how long a worker waits for room: the longest of all places."""
+        return max(member.retry_s for member in self._members or self.members())
+
+    def at(self, number: int) -> Member:
+        """Where a worker is, or will be as far as is known."""
+        with self._lock:
+            if number not in self._at:
+                members = self._open_ones()
+                return members[number % len(members)]
+            return self._at[number]
+
+    def candidates(self, number: int) -> Iterator[Member]:
+        """Where a worker may go: the best place first, each of the others if that has refused."""
+        tried: list[Member] = []
+        took = False
+        for places in (self.members, self._open_ones):
+            while left := [member for member in places() if member not in tried]:
+                best = self._best(number, left)
+                tried.append(best)
+                if self._opens(number, best):
+                    took = True
+                    yield best
+            if took:
+                return
+
+    def _best(self, number: int, members: list[Member]) -> Member:
+        """The best of these, and note that the worker goes there."""
+        order = {member: place for place, member in enumerate(members)}
+        with self._lock:
+            members = sorted(members, key=self._ranks(number, order, {}))
+        # some are asked, and more only if none of these has room: there may be a thousand, which
+        # do not even answer
+        until = monotonic() + ASK_S
+        for some in (members[start : start + _ASKED] for start in range(0, len(members), _ASKED)):
+            rooms = self._rooms.ask(some) if self._rooms and len(members) > 1 else {}
+            with self._lock:
+                rank = self._ranks(number, order, rooms)
+                best = min(some, key=rank)
+                full = rank(best)[:2] != (False, False)
+                if not full or some[-1] is members[-1] or monotonic() >= until:
+                    self._at[number], self._placed_s[number] = best, monotonic()
+                    return best
+        raise AssertionError("there are no places")
+
+    def _open_ones(self) -> list[Member]:
+        """Those that are made for the repository; before that all."""
+        members = self._members or self.members()
+        opened = [one for one in members if one.is_open]
+        return opened or members
+
+    def _opens(self, number: int, member: Member) -> bool:
+        """Whether a worker can go there; one that was absent is made for the repository."""
+        try:
+            if self._repository is not None:
+                member.open_for(self._repository)
+        except EnvHubError as error:
+            WORKER.warning("%s joins the fleet in vain: %s", member.address, error)
+            with self._lock:
+                self._at.pop(number, None)
+            return False
+        return True
+
+    def _ranks(
+        self, number: int, order: dict[Member, int], rooms: dict[Member, Room]
+    ) -> Callable[[Member], tuple[object, ...]]:
+        """What the best place for a worker has least of."""
+        placed: dict[Member, list[float]] = {}
+        for worker, at in self._at.items():
+            if worker != number:
+                placed.setdefault(at, []).append(self._placed_s[worker])
+
+        def rank(member: Member) -> tuple[object, ...]:
+            room, here = rooms.get(member, Room()), placed.get(member, [])
+            left = room.workers - sum(at_s > room.known_s for at_s in here)
+            moves, share = self._at.get(number) is not member, len(here) / member.weight
+            return not room.answers, left < 1, moves, share, -left, order[member]
+
+        return rank
+
+
+def _all_together(each: Iterable[Runtime]) -> Runtime:
+    """One that stands for all: that of places that are alike, or else a name of them together."""
+    runtimes = sorted(set(each), key=lambda one: (one.python, one.packages))
+    if len(runtimes) == 1:
+        return runtimes[0]
+    # it is looked up as a path, which thousands of addresses are too long for
+    digest = hashlib.sha256(repr([tuple(one) for one in runtimes]).encode())
+    return Runtime(f"fleet/of/{digest.hexdigest()}")
+
+
+class Seat(Sandbox):
+    """The place of one worker of a fleet, wherever that is at present."""
+
+    name = "fleet"
+
+    def __init__(self, placement: Placement, number: int) -> None:
+        self._placement = placement
+        self._number = number
+
+    @property
+    def retry_s(self) -> float:  # type: ignore[override]
+        """The longest of all places."""
+        return self._placement.retry_s()
+
+    @property
+    def address(self) -> str:
+        """See ``Sandbox``."""
+        return self._placement.at(self._number).address
+
+    def for_repository(
+        self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
+    ) -> Seat:
+        """See ``Sandbox``; ``runtime`` is each place's own."""
+
+        def at(place: Sandbox, runtime: Runtime) -> Sandbox:
+            return place.for_repository(snapshot, policy, runtime, assets)
+
+        self._placement.open_for(at, policy.limits.memory_bytes)
+        return self
+
+    def runs_on(self, runtime: Runtime) -> Runtime:
+        """See ``Sandbox``."""
+        return self._placement.runs_on(runtime)
+
+    def candidates(self) -> Iterator[Sandbox]:
+        """See ``Sandbox``."""
+        return self._placement.candidates(self._number)
+
+    def acquire(
+        self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
+    ) -> ServerUse[WorkerServer]:
+        """See ``Sandbox``: where it is."""
+        return self._placement.at(self._number).acquire(store, runtime, idle_s)

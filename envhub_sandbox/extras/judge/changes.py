@@ -1,0 +1,234 @@
+"""What is different between two commits, in terms of what a repository would do.
+
+A finding is the same where it stands in the same file, in a line that reads the same: lines that
+move are no change, and what stands in a changed line is a new finding. So is what is about a whole
+file that was changed: a pickle, an archive, or source of which not all was read.
+"""
+
+from __future__ import annotations
+
+import codecs
+import difflib
+import itertools
+import re
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox.extras.judge.checks import Severity
+from envhub_sandbox.extras.judge.findings import Finding
+from envhub_sandbox.extras.judge.static import Static, bytes_of
+from envhub_sandbox.extras.packages.locks.lockfile import TaskFingerprint
+from envhub_sandbox.extras.packages.locks.making import drift_of_tasks
+from envhub_sandbox.hub.listing import FileRecord, differing
+from envhub_worker.protocol.text import printable, size_text
+
+_MOST_BYTES = 1 << 20
+_LONGEST = 500
+_AROUND, _COMPARED, _MOST_LINES, _WIDEST = 2, 500, 60, 200
+"""Lines around a change; lines compared from the first change on; lines and characters shown."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """One thing that differs.
+
+    Attributes:
+        what: ``"file"``, ``"entry"``, ``"python"``, ``"package"``, ``"import"``, ``"finding"`` or
+            ``"environment"``.
+        how: ``"new"``, ``"gone"``, ``"changed"`` or ``"renamed"``.
+        lines: Of a changed file of text: as ``diff -u`` has them, escaped and bounded.
+    """
+
+    what: str
+    how: str
+    text: str
+    finding: Finding | None = None
+    lines: tuple[str, ...] = ()
+
+    def weighs(self, least: Severity) -> bool:
+        """Whether it is a new finding of at least this severity."""
+        return (
+            self.finding is not None
+            and self.how == "new"
+            and self.finding.check.severity.reaches(least)
+        )
+
+
+def changes(then: Static, now: Static) -> list[Change]:
+    """What differs, in the order of ``Change.what``."""
+    other = _other(then, now)
+    return [
+        *_files(then, now, other),
+        *_value("entry", _entry(then), _entry(now)),
+        *_value("python", _python(then), _python(now)),
+        *_named("package", _packages(then), _packages(now)),
+        *_named("import", _imports(then), _imports(now)),
+        *sorted(_findings(then, now, other), key=_rank),
+    ]
+
+
+def _rank(change: Change) -> int:
+    return 0 if change.finding is None else change.finding.check.severity.rank
+
+
+def _records(read: Static) -> dict[str, FileRecord]:
+    return {one.record.path: one.record for one in read.files}
+
+
+def _other(then: Static, now: Static) -> set[str]:
+    """The files of both that have other bytes."""
+    before, after = _records(then), _records(now)
+    return set(differing(now.snapshot.root, after.values(), before.values())) & set(before)
+
+
+def _files(then: Static, now: Static, other: Collection[str]) -> Iterator[Change]:
+    before, after = _records(then), _records(now)
+    gone = {path: one.digest for path, one in before.items() if path not in after}
+    was = {digest: path for path, digest in gone.items()}
+    moved = {was.get(one.digest) for path, one in after.items() if path not in before}
+    for path in sorted({*before, *after}):
+        if path in other:
+            sizes = f"{size_text(before[path].size)}, now {size_text(after[path].size)}"
+            lines = _changed_lines(then.snapshot.root / path, now.snapshot.root / path)
+            yield Change("file", "changed", _shown(f"{path}: {sizes}"), lines=lines)
+        elif path in gone and path not in moved:
+            yield Change("file", "gone", _shown(path))
+        elif path not in before:
+            yield _new(after[path], was)
+
+
+def _changed_lines(then: Path, now: Path) -> tuple[str, ...]:
+    """How a file's lines differ, as ``diff -u`` shows it; nothing for a file that is no text.
+
+    Few lines are compared, so that no stranger's file can take long.
+    """
+    try:
+        before, after = map(_lines, (then, now))
+    except UnicodeDecodeError:
+        return ()
+    pairs = zip(before, after, strict=False)
+    same = next(
+        (at for at, (old, new) in enumerate(pairs) if old != new), min(len(before), len(after))
+    )
+    start = max(0, same - _AROUND)
+    old, new = (lines[start : start + _COMPARED] for lines in (before, after))
+    found = difflib.unified_diff(old, new, lineterm="", n=_AROUND)
+    lines = [printable(line, _WIDEST) for line in itertools.islice(found, 2, _MOST_LINES + 3)]
+    longest = max(path.stat().st_size for path in (then, now))
+    is_long = longest > _MOST_BYTES or max(len(before), len(after)) > start + _COMPARED
+    if is_long or len(lines) > _MOST_LINES:
+        lines[_MOST_LINES:] = ["... there may be more, from here on not compared"]
+    return tuple(lines)
+
+
+def _lines(path: Path) -> list[str]:
+    """Only a line feed ends one. ``splitlines`` would take a form feed, which is a blank to Python,
+    for the line feed that makes code of the rest of a comment.
+    """
+    text = codecs.getincrementaldecoder("utf-8")().decode(bytes_of(path, _MOST_BYTES))
+    return text.removesuffix("\n").split("\n") if text else []
+
+
+def _new(record: FileRecord, was: Mapping[str, str]) -> Change:
+    if record.digest in was:
+        return Change("file", "renamed", _shown(f"{record.path}: was {was[record.digest]}"))
+    return Change("file", "new", _shown(f"{record.path}: {size_text(record.size)}"))
+
+
+def _shown(text: str) -> str:
+    return printable(text, _LONGEST)
+
+
+def _entry(read: Static) -> str:
+    arguments = " or ".join(f"make_env({text})" for text, _ in read.entries)
+    return f"{read.snapshot.path}: {arguments or 'no make_env at its top'}"
+
+
+def _python(read: Static) -> str:
+    return (read.declared.python if read.declared else "") or "any"
+
+
+def _value(what: str, then: str, now: str) -> Iterator[Change]:
+    if then != now:
+        yield Change(what, "changed", _shown(f"{then}, now {now}"))
+
+
+def _packages(read: Static) -> dict[str, str]:
+    found: dict[str, list[str]] = {}
+    for one in read.declared.wanted if read.declared else ():
+        found.setdefault(one.requirement.name.lower(), []).append(str(one))
+    return {name: ", ".join(sorted(texts)) for name, texts in found.items()}
+
+
+def _imports(read: Static) -> dict[str, str]:
+    return {name: name for name in read.modules}
+
+
+def _named(what: str, then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Change]:
+    for name in sorted({*then, *now}):
+        if name not in then:
+            yield Change(what, "new", _shown(now[name]))
+        elif name not in now:
+            yield Change(what, "gone", _shown(then[name]))
+        else:
+            yield from _value(what, then[name], now[name])
+
+
+def _findings(then: Static, now: Static, other: Collection[str]) -> Iterator[Change]:
+    before, after = _by_line(then, other), _by_line(now, other)
+    for how, mine, others in (("new", after, before), ("gone", before, after)):
+        known = Counter({key: len(found) for key, found in others.items()})
+        for key, found in mine.items():
+            for one in found[known[key] :]:
+                yield Change("finding", how, one.text, one)
+
+
+def _by_line(read: Static, other: Collection[str]) -> dict[tuple[str, ...], list[Finding]]:
+    """Findings by what they say and by the line that they stand in, whatever its number; or by the
+    bytes of their file, where that has ``other`` ones and no line is named, or none can be found:
+    findings have the names of files as far as they are printed.
+    """
+    lines: dict[str, list[str]] = {}
+    found: dict[tuple[str, ...], list[Finding]] = {}
+    records = _records(read)
+    digests: dict[str, list[str]] = {}
+    for path in other:
+        digests.setdefault(printable(path, _LONGEST), []).append(records[path].digest)
+    for one in read.findings:
+        text = sorted(digests.get(one.file, ()))
+        if one.line and one.file in records:
+            if one.file not in lines:
+                data = bytes_of(read.snapshot.root / one.file, _MOST_BYTES)
+                split = re.split("\r\n|\r|\n", data.decode("utf-8", "replace"))
+                lines[one.file] = [line.strip() for line in split]
+            text = lines[one.file][one.line - 1 : one.line]
+        found.setdefault((one.id, one.file, one.message, *text), []).append(one)
+    return found
+
+
+def environments(then: Sequence[TaskFingerprint], now: Sequence[TaskFingerprint]) -> list[Change]:
+    """What differs in what two of them return. Trust: input from the worker, already checked."""
+    lines = (line.removeprefix("environment ") for line in drift_of_tasks(then, now))
+    return [Change("environment", "changed", _shown(line)) for line in lines]
+
+
+def document(then: Static, now: Static, found: list[Change]) -> dict[str, Any]:
+    """All of it, as plain data."""
+    return {
+        "then": then.reference,
+        "now": now.reference,
+        "same": not found,
+        "changes": [
+            {
+                "what": one.what,
+                "change": one.how,
+                "text": one.text,
+                "finding": one.finding and one.finding.document(),
+                "lines": list(one.lines),
+            }
+            for one in found
+        ],
+    }

@@ -1,0 +1,175 @@
+"""A report in the forms that others read: JSON, JUnit's XML, SARIF, and GitHub's annotations.
+
+Its texts are partly a stranger's: they are printable and bounded when they get here, and each form
+escapes what means something in it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any
+from urllib.parse import quote
+from xml.etree import ElementTree
+
+from envhub_sandbox.extras.judge.checks import CHECKS, Severity
+from envhub_sandbox.extras.judge.findings import Finding, Report
+
+_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
+_GITHUB = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.NOTE: "notice"}
+# what XML 1.0 has no way to write at all
+_NO_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def document(report: Report, failures: Sequence[Finding]) -> dict[str, Any]:
+    """Everything, as plain data."""
+    return {
+        "reference": report.reference,
+        "commit": report.commit,
+        "passed": not failures,
+        "findings": [
+            {**one.document(), "cure": one.cure, "task": one.task or None, "fails": one in failures}
+            for one in report.findings
+        ],
+        "left_out": report.left_out,
+        "unjudged": {"checks": report.unmade, "tasks": report.waiting},
+        "held": [{"check": check, "task": task} for check, task in report.passed],
+        "figures": report.figures,
+        "confinement": None if report.confinement is None else report.confinement.document(),
+        "provenance": report.provenance,
+    }
+
+
+def junit(report: Report, failures: Sequence[Finding]) -> str:
+    """One test case for each check of each task; what does not fail the whole is its output."""
+    return xml(suite(report, failures))
+
+
+def xml(root: ElementTree.Element) -> str:
+    """A document as text."""
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def suite(report: Report, failures: Sequence[Finding]) -> ElementTree.Element:
+    """A report as one of JUnit's suites."""
+    asked = dict.fromkeys([*((one.id, one.task) for one in report.findings), *report.passed])
+    failed = dict.fromkeys((one.id, one.task) for one in failures)
+    unjudged = [*((check, "") for check in report.unmade), *(("*", one) for one in report.waiting)]
+    made = ElementTree.Element(
+        "testsuite",
+        name=xml_text(report.reference),
+        tests=str(len(asked) + len(unjudged)),
+        failures=str(len(failed)),
+        errors="0",
+        skipped=str(len(unjudged)),
+    )
+    for check, task in asked:
+        case = _case(made, check, task)
+        found = [one for one in report.findings if (one.id, one.task) == (check, task)]
+        text = "\n".join(one.text for one in found)
+        if (check, task) in failed:
+            words = xml_text(CHECKS[check].sentence)
+            ElementTree.SubElement(case, "failure", message=words).text = xml_text(text)
+        elif found:
+            ElementTree.SubElement(case, "system-out").text = xml_text(text)
+    for check, task in unjudged:
+        ElementTree.SubElement(_case(made, check, task), "skipped", message="not judged")
+    return made
+
+
+def _case(suite: ElementTree.Element, check: str, task: str) -> ElementTree.Element:
+    where = xml_text(task or "repository")
+    return ElementTree.SubElement(suite, "testcase", classname=where, name=check)
+
+
+def xml_text(text: str) -> str:
+    """Without what XML cannot say."""
+    return _NO_XML.sub("?", text)
+
+
+def sarif(report: Report, failures: Sequence[Finding]) -> str:
+    """SARIF 2.1.0. What stands in no file is said of the entry file's folder."""
+    rules = [
+        {
+            "id": check.id,
+            "shortDescription": {"text": check.sentence},
+            "help": {"text": check.cure},
+            "defaultConfiguration": {"level": check.severity.value},
+        }
+        for check in CHECKS.values()
+    ]
+    run = {
+        "tool": {"driver": {"name": "envhub check", "rules": rules}},
+        "results": [_result(one, failures, report.folder) for one in report.findings],
+        "invocations": [{"executionSuccessful": not (report.unmade or report.waiting)}],
+        "columnKind": "unicodeCodePoints",
+    }
+    return json.dumps({"$schema": _SCHEMA, "version": "2.1.0", "runs": [run]}, indent=2) + "\n"
+
+
+def _result(one: Finding, failures: Sequence[Finding], folder: str) -> dict[str, Any]:
+    where = f"{one.task}: " if one.task else ""
+    place: dict[str, Any] = {"artifactLocation": {"uri": quote(folder + (one.file or "env.py"))}}
+    if one.line:
+        place["region"] = {"startLine": one.line}
+    return {
+        "ruleId": one.id,
+        "level": one.check.severity.value,
+        "message": {"text": _sarif_text(f"{where}{one.message}")},
+        "locations": [{"physicalLocation": place}],
+        "properties": {"fails": one in failures},
+    }
+
+
+def _sarif_text(text: str) -> str:
+    """Without SARIF's embedded links and placeholders."""
+    plain = re.sub(r"([\\\[\]])", r"\\\1", text)
+    return plain.replace("{", "{{").replace("}", "}}")
+
+
+def workflow_commands(report: Report) -> Iterator[str]:
+    """GitHub's workflow commands, one a line: a stranger's text cannot begin another."""
+    for one in report.findings:
+        place = f"file={_property(report.folder + one.file)}," if one.file else ""
+        place += f"line={one.line}," if one.line else ""
+        title = f"envhub check: {one.id}" + (f" ({one.task})" if one.task else "")
+        text = f"{one.message}\n{one.cure}"
+        yield workflow_command(_GITHUB[one.check.severity], title, text, place)
+    if report.confinement is not None and report.confinement.is_partial:
+        words = "\n".join(report.confinement.lines())
+        yield workflow_command("notice", "envhub check: confinement", words)
+
+
+def workflow_command(level: str, title: str, text: str, place: str = "") -> str:
+    """One of them; a place has its properties escaped already."""
+    return f"::{level} {place}title={_property(title)}::{_data(text)}"
+
+
+def _data(text: str) -> str:
+    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+
+
+def _property(text: str) -> str:
+    return _data(text).replace(":", "%3A").replace(",", "%2C")
+
+
+def summary(report: Report, failures: Collection[Finding]) -> str:
+    """A table for GitHub's step summary; a stranger's text is no markup there."""
+    lines = [f"### envhub check: {report.verdict(failures)}", "", cell(report.reference), ""]
+    if report.confinement is not None:
+        lines += [*(f"- {cell(line)}" for line in report.confinement.lines()), ""]
+    if report.findings:
+        lines += ["| | check | task | finding |", "| --- | --- | --- | --- |"]
+    for one in report.findings:
+        mark = "**fails**" if one in failures else one.check.severity.value
+        lines.append(f"| {mark} | {one.id} | {cell(one.task)} | {cell(one.text)} |")
+    return "\n".join(lines) + "\n"
+
+
+def cell(text: str) -> str:
+    """A cell of a table in Markdown: each character that means something there by its number."""
+    return re.sub(
+        r"[^a-zA-Z0-9 ,;=-]", lambda found: f"&#{ord(found[0])};", text.replace("\n", " ")
+    )

@@ -1,0 +1,222 @@
+"""How a repository is judged, and the files of the caller's that say so: a policy, and options.
+
+Nothing of the repository that is judged is read here: it has no say in how it is judged.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from envhub_sandbox.errors import EnvHubError, PolicyError
+from envhub_sandbox.hub.checkout import top_of
+from envhub_sandbox.hub.local import split_local
+from envhub_sandbox.hub.snapshot import is_here
+from envhub_sandbox.hub.sources import toml
+from envhub_sandbox.settings.options import in_python, nearest, use_option_names
+from envhub_sandbox.settings.policy import policy_from
+from envhub_worker.protocol.text import printable, size_text
+
+if TYPE_CHECKING:
+    from envhub_sandbox.vector.suites import EnvSuites
+
+_MOST_BYTES = 16 << 10
+_LONGEST = 500
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgeOptions:
+    """What is judged, and how.
+
+    Attributes:
+        arguments: Of ``make_env``, beyond the reference.
+        seed, steps: The seed and the steps of each play.
+        resets: Resets in each of four rounds that look for leaks; 0 skips them.
+        slow_step_s: Longest permitted median step; resets may take five times as long.
+        episode_steps: In which some episode has to end, if 30 seconds suffice for them.
+        tasks: Chooses ``(suite, task)`` pairs of the environments.
+        pictures: Also gather what only a page shows: frames, and memory over time.
+    """
+
+    reference: str
+    arguments: Mapping[str, Any]
+    seed: int = 0
+    steps: int = 200
+    resets: int = 8
+    slow_step_s: float = 1.0
+    episode_steps: int = 10_000
+    tasks: Callable[[EnvSuites], list[tuple[str, Any]]] = field(
+        default=lambda suites: [(suite, task) for suite in suites for task in suites[suite]]
+    )
+    tell: Callable[[str], None] = lambda what: None
+    pictures: bool = False
+
+
+def merged_settings(policy: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """A file's policy, changed by what was given as options, limit by limit.
+    Raises ``PolicyError``: the file's limits are no table.
+    """
+    limits = policy.get("limits", {})
+    if not isinstance(limits, Mapping):
+        raise PolicyError("limits are a table: [limits], with a line for each")
+    both = {**limits, **given.get("limits", {})}
+    return {**policy, **given, **({"limits": both} if both else {})}
+
+
+def read_settings(path: Path, known: Collection[str]) -> dict[str, Any]:
+    """The options in ``[check]`` of a caller's file, by their names in Python, of those ``known``.
+
+    It is named, and never looked for: the folder that one is in may be a stranger's clone, and a
+    file that lies there would let him say what he may do and what fails him.
+    Raises ``PolicyError``: the file cannot be read, or says what there is not.
+    """
+    document = read_file(path)
+    if tables := sorted(set(document) - {"check"}):
+        raise PolicyError(
+            f"{path} has {', '.join(tables)}{nearest(tables[0], ['check'])}; all that is read is "
+            "[check], and below it a line for each option"
+        )
+    table = document.get("check", {})
+    if not isinstance(table, Mapping):
+        raise PolicyError(
+            f"check in {path} is not a table; write [check] and below it a line for each option"
+        )
+    asked = {name.replace("-", "_"): value for name, value in table.items()}
+    unknown = sorted(set(asked) - set(known))
+    if unknown:
+        names = [name.replace("_", "-") for name in sorted(known)]
+        near = nearest(unknown[0].replace("_", "-"), names)
+        raise PolicyError(
+            f"[check] in {path} has no option {', '.join(unknown)}{near}; there are "
+            f"{', '.join(names)}"
+        )
+    return asked
+
+
+def is_judged(path: Path, reference: str) -> bool:
+    """Whether a file lies in what is judged, by whatever links one gets there; or is named so, and
+    a link in there leads out.
+    """
+    folder = _folder_of(reference)
+    if folder is None:
+        return False
+    is_in_it = Path(os.path.realpath(path)).is_relative_to(folder)
+    return is_in_it or _named_in(path, folder) is not None
+
+
+def _folder_of(reference: str) -> str | None:
+    """Where what is judged lies, without links; None for what is not of this machine."""
+    if not is_here(reference):
+        return None
+    try:
+        return os.path.realpath(split_local(reference).folder)
+    except EnvHubError:
+        return None  # nothing is judged: what reads it says why
+
+
+def folder_below_here(reference: str) -> str:
+    """Where what is judged lies below the current folder, with a slash at its end; empty where it
+    is that folder, or lies elsewhere.
+    """
+    folder, here = _folder_of(reference), Path(os.path.realpath(os.curdir))
+    if folder is None or here not in Path(folder).parents:
+        return ""
+    return f"{printable(Path(folder).relative_to(here).as_posix(), _LONGEST)}/"
+
+
+def _named_in(path: Path, folder: str) -> Path | None:
+    """Where a path below a folder leads, if none of the links in there is followed."""
+    whole = Path(os.path.abspath(path))
+    tops = [one for one in whole.parents if os.path.realpath(one) == folder]
+    return Path(folder, whole.relative_to(tops[-1])) if tops else None
+
+
+def _named_in_checkout(path: Path, reference: str) -> Path | None:
+    """``_named_in`` of the checkout of git that the judged folder lies in, or of the folder."""
+    if not is_here(reference):
+        return None
+    # a checkout need not have the folder any more
+    folder = Path(_folder_of(reference) or os.path.realpath(os.path.expanduser(reference)))
+    return _named_in(path, str(top_of(folder) or folder))
+
+
+def is_in_its_checkout(path: Path, reference: str) -> bool:
+    """Whether a place lies in what is judged, or in the checkout of git around that."""
+    return _named_in_checkout(Path(os.path.realpath(path)), reference) is not None
+
+
+def refuse_link_of_the_judged(path: Path, reference: str) -> None:
+    """No repository says where a report goes: a link that it has there, or that its checkout has,
+    could lead to any file of the user's. Raises ``PolicyError``: there is one.
+    """
+    named = _named_in_checkout(path, reference)
+    if named is not None and Path(os.path.realpath(path)) != named:
+        raise PolicyError(
+            f"{path} is, or lies behind, a link in the repository that is checked, {reference}, "
+            "which could lead to any file: take a place outside"
+        )
+
+
+@contextlib.contextmanager
+def no_report_but_ours(places: Collection[Path | None], reference: str) -> Iterator[None]:
+    """Where a judgement ends without its reports, let none of the repository's own stand there:
+    CI would show as a result what its author has written.
+    """
+    try:
+        yield
+    except BaseException:
+        for path in filter(None, places):
+            named = _named_in_checkout(path, reference)
+            # a link there goes, too; behind a link lies what is not the repository's
+            if named is not None and Path(os.path.realpath(path.parent)) == named.parent:
+                with contextlib.suppress(OSError):
+                    path.unlink(missing_ok=True)
+        raise
+
+
+def refuse_files_of_the_judged(
+    places: Mapping[str, Path | None], reference: str, where: str = ""
+) -> None:
+    """No repository says how it is judged, and none holds what is found in it: refuse such places.
+    Raises ``PolicyError``: one lies in it.
+    """
+    for option, path in places.items():
+        if path is not None and is_judged(path, reference):
+            raise PolicyError(
+                f"{option} {path} is inside the repository that is checked, {reference}{where}, "
+                "and a repository must not influence its own check: take a place outside"
+            )
+
+
+def read_policy(path: Path) -> dict[str, Any]:
+    """The fields of a ``Policy`` in a caller's file.
+    Raises ``PolicyError``: it cannot be read, or a field is wrong; the text names the file.
+    """
+    fields = read_file(path)
+    try:
+        with use_option_names(in_python):  # the file has those names, not the command line's
+            policy_from(fields, None)
+    except PolicyError as error:
+        raise PolicyError(f"{path}: {error}") from error
+    return fields
+
+
+def read_file(path: Path) -> dict[str, Any]:
+    """A caller's TOML.
+    Raises ``PolicyError``: it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(_MOST_BYTES + 1)
+    except OSError as error:
+        raise PolicyError(f"{path} cannot be read: {error.strerror}") from error
+    if len(data) > _MOST_BYTES:
+        raise PolicyError(f"{path} is larger than {size_text(_MOST_BYTES)}")
+    try:
+        return toml.loads(data.decode("utf-8"), _MOST_BYTES)
+    except ValueError as error:
+        raise PolicyError(f"{path} is not valid TOML: {error}") from error

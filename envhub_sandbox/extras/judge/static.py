@@ -1,0 +1,386 @@
+"""``Static``: all that is read of a repository without running it, put together and as JSON.
+
+``survey`` looks at each file: its kind, and findings in it. What is found is a hint for a person
+and no wall: who wants to hide a call can. The walls are the sandbox's. What could not be read is
+found, too. ``undeclared`` says which of the imports nothing declares.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from pathlib import Path, PurePosixPath
+from types import MappingProxyType
+from typing import Any
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from envhub_sandbox.errors import DependencyError, SnapshotError
+from envhub_sandbox.extras.judge import contents
+from envhub_sandbox.extras.judge.findings import Finding
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.declared import DeclaredPackages, declared
+from envhub_sandbox.extras.packages.resolution.resolve import WORKERS
+from envhub_sandbox.hub.checkout import Checkout, is_unread
+from envhub_sandbox.hub.listing import FileRecord
+from envhub_sandbox.hub.local import IGNORED, REPOSITORY, LocalFolder
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.hub.sources import parsing
+from envhub_sandbox.hub.sources.parsing import MOST_BYTES, Import, ParsedFile, imports
+from envhub_worker.protocol.text import counted, printable
+
+_LONGEST = 500
+_MOST_BYTES_OF_TEXT = 1 << 20
+_MOST_BYTES_IN_ALL = 32 << 20
+_MOST_OF_A_FILE = 100
+_MOST = 20_000
+"""Findings: as many as there may be files."""
+_OF_EACH = 20
+"""Of one check, which are kept whatever there is of others."""
+_LONGEST_LINK = 1024
+_SHOWN_IGNORED = 10
+
+
+@dataclass(frozen=True)
+class File:
+    """One file. ``kind``: as in ``"Python"``, ``"text"``, ``"binary"``, ``"machine code"``."""
+
+    record: FileRecord
+    kind: str
+
+
+@dataclass
+class Survey:
+    """What was read. ``findings``: what is worth a look, file by file."""
+
+    files: list[File] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+    _kept: Counter[str] = field(default_factory=Counter, repr=False)
+
+    def add(self, found: Iterable[Finding]) -> None:
+        """Take what was found in one place, as far as there is room."""
+        for one in found:
+            self._kept[one.id] += 1
+            if len(self.findings) < _MOST or self._kept[one.id] <= _OF_EACH:
+                self.findings.append(one)
+
+
+def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Survey:
+    """Look at every file of a repository, and at what ``parsing.read`` read of it."""
+    found = Survey()
+    if snapshot.repo_type != "pypi":  # whose one file is ours
+        found.add(_papers(snapshot))
+    found.add(_in_place(snapshot))
+    found.add(_in_front(snapshot))
+    left, unread = _MOST_BYTES_IN_ALL, 0
+    for record in sorted(snapshot.files, key=lambda one: one.path):
+        path = snapshot.root / record.path
+        ending = bytes_of(path, contents.ENDING, max(record.size - contents.ENDING, 0))
+        kind = contents.kind_of_contents(record.path, bytes_of(path, contents.BEGINNING), ending)
+        found.files.append(File(record, kind))
+        found.add(contents.of_kind(record.path, kind, is_folder=snapshot.is_local))
+        for one in contents.hidden(record.path, record.path, is_code=True):
+            found.add([Finding(one.id, f"its name {one.message}", file=record.path)])
+        if record.path in parsed:
+            found.add(_in_code(record, parsed[record.path]))
+        if parsed.get(record.path) is not None:
+            found.add(_in_text(record, path, is_code=True))
+        elif kind in ("Python", "text") and record.size <= min(left, _MOST_BYTES_OF_TEXT):
+            left -= record.size
+            found.add(_in_text(record, path, is_code=kind == "Python"))
+        else:
+            unread += kind == "text"
+    if unread:
+        texts = counted(unread, "text is", "texts are")
+        message = f"{texts} more than is read: 1 MiB of a file, and 32 MiB in all"
+        found.findings.append(Finding("source-unread", message))
+    if len(found.findings) >= _MOST:
+        found.findings.append(Finding("source-unread", "there is more to find than is kept"))
+    return found
+
+
+def bytes_of(path: Path, most: int, start: int = 0) -> bytes:
+    """So many of a file; none of one that cannot be read."""
+    try:
+        with path.open("rb") as file:
+            file.seek(start)
+            return file.read(most)
+    except OSError:
+        return b""
+
+
+def _in_text(record: FileRecord, path: Path, *, is_code: bool) -> Iterator[Finding]:
+    text = bytes_of(path, record.size).decode("utf-8-sig", "replace")
+    yield from contents.hidden(record.path, text, is_code=is_code)
+    if is_code:
+        yield from contents.long_lines(record.path, text)
+
+
+def _in_code(record: FileRecord, parsed: ParsedFile | None) -> Iterator[Finding]:
+    if parsed is None:
+        larger = f"it is larger than {MOST_BYTES >> 10} KiB"
+        other = "it is more than can be read of a file, or of a repository"
+        message = larger if record.size > MOST_BYTES else other
+        yield Finding("source-unparsed", message, file=record.path)
+        return
+    if not parsed.is_python:
+        yield _unread(record, "it is not Python of this version")
+    if parsed.encoding is not None:
+        named = f"Python reads it as {parsed.encoding}" if parsed.encoding else "it is not UTF-8"
+        yield Finding("source-encoding", f"{named}, and it has not been read", file=record.path)
+    found = contents.constructs(record.path, parsed)
+    yield from itertools.islice(found, _MOST_OF_A_FILE)
+    if next(found, None) is not None:
+        yield _unread(record, f"there is more in it than the first {_MOST_OF_A_FILE} findings")
+    elif not parsed.is_whole:
+        yield _unread(record, "it imports or names more than is kept of a file")
+
+
+def _unread(record: FileRecord, why: str) -> Finding:
+    return Finding("source-unread", why, file=record.path)
+
+
+def _in_place(snapshot: Snapshot) -> Iterator[Finding]:
+    """Links, and where a folder is not what its commit is."""
+    if not snapshot.is_local:
+        yield from _links(snapshot)
+        return
+    try:
+        here = LocalFolder.of(snapshot)
+        if here.checkout is None:
+            yield from _links_of_folder(here)
+            if is_unread(here.root):
+                message = "git cannot say what its commit has: is it installed? Are its ids SHA-1?"
+                yield Finding("source-uncommitted", message)
+        else:
+            yield from _links(snapshot)
+            yield from _uncommitted(here.checkout, snapshot)
+        yield from _left_out(here)
+    except OSError as error:
+        raise SnapshotError(f"{snapshot.label}: it has changed meanwhile: {error}") from error
+
+
+def _links(snapshot: Snapshot) -> Iterator[Finding]:
+    """Links of git's, which come from the Hub, and so from a checkout, as files with their text."""
+    there = {record.path for record in snapshot.files}
+    there |= {str(parent) for path in there for parent in PurePosixPath(path).parents}
+    for record in snapshot.files:
+        target = _target(snapshot, record, there)
+        if target is not None:
+            message = f"reads like a link of git's, to {target}"
+            yield Finding("source-link", message, file=record.path)
+
+
+def _links_of_folder(here: LocalFolder) -> Iterator[Finding]:
+    """Links were followed when the folder was copied, and lead nowhere else."""
+    for file in here.files():
+        if file.source != here.root / file.path:
+            target = file.source.relative_to(here.root)
+            yield Finding("source-link", f"a link to {target}", file=file.path)
+
+
+def _uncommitted(checkout: Checkout, snapshot: Snapshot) -> Iterator[Finding]:
+    for name in checkout.held_back:
+        message = "git does not look at it for changes, so its commit may have another version"
+        yield Finding("source-uncommitted", message, file=name)
+    for name, attribute in checkout.converted(record.path for record in snapshot.files):
+        message = f"git commits it with other bytes, by {attribute} in .gitattributes"
+        yield Finding("source-uncommitted", message, file=name)
+
+
+def _left_out(here: LocalFolder) -> Iterator[Finding]:
+    left: dict[str, list[str]] = {}
+    for one in here.left_out():
+        if one.why == REPOSITORY:
+            message = "a git repository of its own: the commit around it has none of its files"
+            yield Finding("source-uncommitted", message, file=one.path)
+        else:
+            left.setdefault(one.why, []).append(one.path)
+    for why, paths in left.items():
+        more = len(paths) - _SHOWN_IGNORED
+        shown = ", ".join([*paths[:_SHOWN_IGNORED], *([f"{more} more"] if more > 0 else [])])
+        begin = "git leaves out" if why == IGNORED else f"left out, {why}:"
+        yield Finding("source-ignored", f"{begin} {shown}")
+
+
+def _in_front(snapshot: Snapshot) -> Iterator[Finding]:
+    """Extension modules that Python imports rather than the source beside them."""
+    there = {record.path for record in snapshot.files}
+    for path in sorted(path for path in there if path.endswith(".so")):
+        folder, slash, name = path.rpartition("/")
+        module = name.partition(".")[0]
+        sources = [f"{folder}{slash}{module}.py"]
+        if folder and module == "__init__":  # a package comes before a module of its name
+            sources.append(f"{folder}.py")
+        for source in filter(there.__contains__, sources):
+            message = f"machine code that runs in place of {source}"
+            yield Finding("source-compiled", message, file=path)
+
+
+def _target(snapshot: Snapshot, record: FileRecord, there: set[str]) -> str | None:
+    if record.size > _LONGEST_LINK:
+        return None
+    text = bytes_of(snapshot.root / record.path, _LONGEST_LINK).decode("utf-8", "replace")
+    if not text or not text.isprintable() or text != text.strip():
+        return None
+    if text.startswith(("../", "/")):
+        return text
+    beside = str(PurePosixPath(record.path).parent / text)
+    return text if beside in there else None
+
+
+def _papers(snapshot: Snapshot) -> Iterator[Finding]:
+    top = {record.path.lower() for record in snapshot.files if "/" not in record.path}
+    if "readme.md" not in top:
+        yield Finding("card", "there is no README.md")
+    licensed = any(name.startswith(("license", "licence", "copying")) for name in top)
+    if not licensed and not _card_names_a_licence(snapshot.root):
+        yield Finding("licence", "there is no LICENSE file, and README.md's head names none")
+
+
+def _card_names_a_licence(root: Path) -> bool:
+    try:
+        with (root / "README.md").open(encoding="utf-8", errors="replace") as file:
+            head = file.read(16_384)
+    except OSError:
+        return False
+    block = head.split("\n---", 1)[0] if head.startswith("---") else ""
+    return any(line.startswith("license:") for line in block.splitlines())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Static:
+    """What was read; nothing of it ran.
+
+    Attributes:
+        entries: The arguments of each ``make_env`` at the top of the entry file, and its line.
+        imports: What the entry file leads to and the repository does not have, by name.
+        declared: What it declares; None where it says nothing, or nothing that can be taken.
+        findings: What is worth a look.
+    """
+
+    snapshot: Snapshot
+    files: list[File]
+    entries: tuple[tuple[str, int], ...]
+    imports: list[Import]
+    declared: DeclaredPackages | None
+    findings: list[Finding]
+
+    @property
+    def reference(self) -> str:
+        """What was read, pinned."""
+        return self.snapshot.reference
+
+    @property
+    def modules(self) -> dict[str, Import]:
+        """Each module that is imported, with the first place."""
+        return {one.name: one for one in reversed(self.imports)}
+
+    def is_brought(self, module: str) -> bool:
+        """Whether a package of a module's name is declared, or in every sandbox.
+
+        Some packages have another name than their modules.
+        """
+        wanted = [one.requirement for one in self.declared.wanted] if self.declared else []
+        names = {canonicalize_name(one.name) for one in [*wanted, *map(Requirement, WORKERS)]}
+        return canonicalize_name(module) in names
+
+
+def static(snapshot: Snapshot) -> Static:
+    """Read a repository."""
+    parsed = parsing.read(snapshot)
+    surveyed = survey(snapshot, parsed)
+    entry = parsed.get(snapshot.path)
+    findings, says = surveyed.findings, None
+    try:
+        says = declared(snapshot.root, snapshot.path)
+    except DependencyError as error:
+        findings = [Finding("requirements", str(error)), *findings]
+    return Static(
+        snapshot=snapshot,
+        files=surveyed.files,
+        entries=() if entry is None else entry.entries,
+        imports=imports(snapshot, parsed),
+        declared=says,
+        findings=sorted(map(_printable, findings), key=lambda one: one.check.severity.rank),
+    )
+
+
+def _printable(one: Finding) -> Finding:
+    file, message = printable(one.file, _LONGEST), printable(one.message, _LONGEST)
+    return replace(one, file=file, message=message)
+
+
+def document(read: Static) -> dict[str, Any]:
+    """All of it, as plain data."""
+    says = read.declared
+    return {
+        "reference": read.reference,
+        "entry": {
+            "file": read.snapshot.path,
+            "make_env": [{"arguments": text, "line": line} for text, line in read.entries],
+        },
+        "files": [
+            {
+                "path": one.record.path,
+                "bytes": one.record.size,
+                "hash": one.record.digest,
+                "kind": one.kind,
+            }
+            for one in read.files
+        ],
+        "declared": says
+        and {"source": says.source, "python": says.python, "packages": list(map(str, says.wanted))},
+        "imports": [
+            {
+                "name": one.name,
+                "file": one.file,
+                "line": one.line,
+                "brought": read.is_brought(name),
+            }
+            for name, one in sorted(read.modules.items())
+        ],
+        "findings": [one.document() for one in read.findings],
+    }
+
+
+def undeclared(
+    found: list[Import],
+    stated: Mapping[str, Requirement],
+    packages: Path | None,
+    taken: Mapping[str, str] = MappingProxyType({}),
+) -> list[Finding]:
+    """The imports that nothing declared brings along.
+
+    Args:
+        stated: What the repository declares, by canonical name.
+        packages: The environment that was made of it; None where this interpreter serves.
+        taken: Modules that were installed although nothing declares them, and what needs them.
+    """
+    brought = _of_this_interpreter({} if packages else stated)
+    if packages:
+        brought |= {path.name.partition(".")[0] for path in packages.iterdir()}
+    missing = [one for one in found if one.name not in brought or one.name in taken]
+    named = {one.name for one in missing}
+    found_at = [(f"{one.name} is imported", one.file, one.line) for one in missing]
+    found_at += [(where, "", 0) for module, where in taken.items() if module not in named]
+    return [
+        Finding("imports", f"{what}, and nothing declares it", "", file, line)
+        for what, file, line in found_at
+    ]
+
+
+def _of_this_interpreter(declared: Mapping[str, Requirement]) -> set[str]:
+    wanted = [*map(Requirement, WORKERS), *declared.values()]
+    return {module for one in interpreters.brought(wanted) for module in _modules(one)}
+
+
+def _modules(found: metadata.Distribution) -> set[str]:
+    """What a distribution lets one import; Python 3.10 itself overlooks some of it."""
+    named = (found.read_text("top_level.txt") or "").split()
+    tops = {file.parts[0] for file in found.files or () if file.suffix in (".py", ".so")}
+    return {*named, *(top.partition(".")[0] for top in tops)}

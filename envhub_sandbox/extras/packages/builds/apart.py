@@ -1,0 +1,101 @@
+"""Fetches and reads what a stranger has packed, in a process of its own, within one deadline:
+``python -I -m envhub_sandbox.extras.packages.builds.apart OWNER``.
+
+An archive may hold what takes its reader hours or gigabytes. So the reader is a process that can be
+ended, and its memory has a limit. The order comes as JSON on stdin; the answer, or the error, goes
+to stdout. It ends with the process that started it.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox.errors import DependencyError, EnvHubError, known_reason
+from envhub_sandbox.extras.packages.builds import download, trees, wheels
+from envhub_sandbox.extras.packages.interpreters import Interpreter
+from envhub_sandbox.system.platform import end_with, pidfd, program
+from envhub_worker.protocol.text import printable
+
+if sys.platform == "linux":
+    import resource
+
+DEADLINE_S = 1800.0
+"""For the download of a source and its unpacking together; and for a look at a wheel."""
+_MEMORY_BYTES = 4 * 2**30
+_SHOWN = 6000
+
+
+def fetch(url: str, sha256: str, archive: Path, tree: Path, title: str) -> Path:
+    """Download and unpack a source distribution into an empty folder; gives its one top folder.
+    ``archive``: where the download lies meanwhile. Raises ``DependencyError``.
+    """
+    order = {"url": url, "sha256": sha256, "archive": str(archive), "tree": str(tree)}
+    return Path(_asked({"title": title, **order}, title))
+
+
+def check_wheel(wheel: Path, name: str, version: str, interpreter: Interpreter) -> None:
+    """As ``wheels.check``."""
+    order = {"wheel": str(wheel), "name": name, "version": version}
+    _asked({**order, "interpreter": vars(interpreter)}, f"the wheel of {name}")
+
+
+def _asked(order: dict[str, Any], title: str) -> str:
+    with pidfd() as ourselves:
+        try:
+            done = subprocess.run(
+                [*program(__name__), str(ourselves)],
+                input=json.dumps(order).encode(),
+                capture_output=True,
+                pass_fds=(ourselves,),
+                start_new_session=True,
+                timeout=DEADLINE_S,
+            )
+        except subprocess.TimeoutExpired:
+            raise DependencyError(
+                f"{title} was not fetched and read within {DEADLINE_S:.0f} s, and is not taken",
+                reason="integrity",
+            ) from None
+    try:
+        said: dict[str, str] = json.loads(done.stdout)
+    except ValueError:
+        shown = printable(done.stderr.decode("utf-8", "replace")[-_SHOWN:], _SHOWN)
+        raise DependencyError(
+            f"{title} cannot be read: the process that reads it ended ({done.returncode}).\n{shown}"
+        ) from None
+    if "error" in said:
+        raise DependencyError(said["error"], reason=known_reason(said["reason"]))
+    return said["answer"]
+
+
+def main(owner: int) -> int:
+    """Carry out the order on stdin."""
+    end_with(owner, 0)
+    if sys.platform == "linux":
+        resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
+    order = json.load(sys.stdin)
+    try:
+        said = {"answer": _carried_out(order)}
+    except EnvHubError as error:
+        said = {"error": str(error), "reason": getattr(error, "reason", "")}
+    print(json.dumps(said))
+    return 0
+
+
+def _carried_out(order: dict[str, Any]) -> str:
+    if "wheel" in order:
+        interpreter = Interpreter(**order["interpreter"])
+        wheels.check(Path(order["wheel"]), order["name"], order["version"], interpreter)
+        return ""
+    archive = Path(order["archive"])
+    download.download(order["url"], order["sha256"], archive)
+    top = trees.unpack_tree(archive, Path(order["tree"]), order["title"])
+    archive.unlink()
+    return str(top)
+
+
+if __name__ == "__main__":
+    sys.exit(main(int(sys.argv[1])))

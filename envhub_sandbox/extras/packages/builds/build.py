@@ -1,0 +1,294 @@
+"""From sources to wheels: fetched, unpacked, built in a jail, checked, kept.
+
+The jail is started by a program of ours (``factory/builder.py``), since packages know nothing of
+sandboxes.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from envhub_sandbox import errors
+from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.extras.packages import environments, interpreters
+from envhub_sandbox.extras.packages.builds import apart, download, project, wheels
+from envhub_sandbox.extras.packages.builds.wheels import MAX_BYTES
+from envhub_sandbox.extras.packages.declared import Source, parse_requirement
+from envhub_sandbox.extras.packages.interpreters import Interpreter
+from envhub_sandbox.extras.packages.request import PackageRequest, Tell
+from envhub_sandbox.extras.packages.resolution.resolve import MOST_SOURCES, Lock
+from envhub_sandbox.hub.logins import without_login
+from envhub_sandbox.system.platform import pidfd, program
+from envhub_worker.protocol.runtime import OWN
+from envhub_worker.protocol.text import printable
+
+PROFILE_VARIABLE = "ENVHUB_BUILD_PROFILE"
+WALL_S = 1800.0
+LIMITS = {"memory_bytes": "8G", "disk_bytes": "6G", "disk_files": 400_000, "cpu_time_s": 7200}
+_PROGRAM = "envhub_sandbox.factory.builder"
+_SHOWN = 6000
+_AROUND_S = 900.0
+_MOST_REQUIRED = 200
+
+
+class BuildFailedError(DependencyError):
+    """The build backend failed, or was ended; the text is what it printed last."""
+
+
+def _in_jail(order: Mapping[str, Any], folder: Path) -> Path | tuple[str, ...]:
+    """A wheel below an empty folder, or what the build backend needs besides.
+
+    Nothing of either has been looked at: they are a stranger's. The order is read by
+    ``factory/builder.py``; limits, profile and what the jail may read are added here. Raises
+    ``BuildFailedError``, or ``DependencyError`` where there is no jail on this host.
+    """
+    said = _run(order, folder)
+    further, name = said.get("requires"), said.get("wheel")
+    if isinstance(further, list) and 0 < len(further) <= _MOST_REQUIRED:
+        return tuple(text for text in further if isinstance(text, str))
+    if not isinstance(name, str):
+        raise BuildFailedError("its build backend produced no wheel")
+    return folder / "wheel" / os.path.basename(name)
+
+
+def _run(order: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    whole = {
+        **order,
+        "readable": [order["source"], order["packages"], str(folder / "tools")],
+        "limits": LIMITS,
+        "wall_s": WALL_S,
+        "max_bytes": MAX_BYTES,
+        "profile": os.environ.get(PROFILE_VARIABLE) or "strict",
+    }
+    (folder / "order.json").write_text(json.dumps(whole))
+    with pidfd() as ourselves:
+        done = subprocess.run(
+            [*program(_PROGRAM), str(folder), str(ourselves)],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            pass_fds=(ourselves,),
+            start_new_session=True,
+            timeout=WALL_S + _AROUND_S,
+        )
+    try:
+        said: dict[str, Any] = json.loads(done.stdout)
+    except ValueError as error:
+        shown = printable(done.stderr.decode("utf-8", "replace")[-_SHOWN:])
+        raise DependencyError(f"the program that builds failed:\n{shown}") from error
+    if "error" in said:
+        kind = getattr(errors, str(said["error"]), DependencyError)
+        text = str(said["said"])
+        if issubclass(kind, errors.SandboxUnavailableError):
+            raise DependencyError(
+                f"sources are built in a jail, and there is none here: {text}. A weaker profile "
+                f"for builds is chosen by {PROFILE_VARIABLE}, as in {PROFILE_VARIABLE}=no-userns"
+            )
+        raise DependencyError(text)
+    if "failed" in said:
+        raise BuildFailedError(printable(str(said["failed"])[-_SHOWN:], _SHOWN))
+    return said
+
+
+Choose = Callable[[PackageRequest, Interpreter, Tell], Lock]
+_DEEPEST = 8
+_ROUNDS = 3
+"""Backends may say what they need besides; once they have it, they may say more."""
+_UNDER_WAY: ContextVar[tuple[str, ...]] = ContextVar("sources that are being built", default=())
+_BUILDS: ContextVar[Iterator[int]] = ContextVar("how many were built for one request")
+
+
+def build_wheels(
+    sources: Sequence[Source], interpreter: Interpreter, tell: Tell, choose: Choose
+) -> list[Path]:
+    """A wheel of each: kept from before, or built in a jail without network.
+
+    ``choose`` gives versions of what they are built with. Raises ``DependencyError`` where one
+    cannot be built, with what is missing here, where sources or a wheel are refused, or where this
+    host has no jail.
+    """
+    if not _UNDER_WAY.get():
+        _BUILDS.set(itertools.count(1))
+    return [_wheel(source, interpreter, tell, choose) for source in sources]
+
+
+def _wheel(source: Source, interpreter: Interpreter, tell: Tell, choose: Choose) -> Path:
+    if source.commit:
+        source = replace(source, commit=download.resolve(source.url, source.commit))
+    known = wheels.recall(source, interpreter)
+    if known is not None:
+        wheels.named(known.name, source.name, source.version)  # one commit, asked for as another
+        return known
+    with _under_way(source), tempfile.TemporaryDirectory(prefix="envhub-build-") as place:
+        Path(place).chmod(0o755)  # a jail's user is another one
+        tree = _fetched(source, Path(place), tell)
+        said = project.read(tree, _title(source))
+        return _Build(source, said, tree, Path(place), interpreter, tell, choose).wheel()
+
+
+@contextmanager
+def _under_way(source: Source) -> Iterator[None]:
+    """Refuse a source that is needed to build itself."""
+    above = _UNDER_WAY.get()
+    chain = (*above, source.name)
+    if source.name in above or len(chain) > _DEEPEST:
+        raise DependencyError(
+            f"{source.name} cannot be built: its build requirement has no wheel, and is built with "
+            f"it in turn ({' <- '.join(chain)})",
+            reason="resolution",
+        )
+    if next(_BUILDS.get()) > MOST_SOURCES:
+        raise DependencyError(
+            f"{chain[0]} needs more than {MOST_SOURCES} packages to be built", reason="resolution"
+        )
+    token = _UNDER_WAY.set(chain)
+    try:
+        yield
+    finally:
+        _UNDER_WAY.reset(token)
+
+
+def _fetched(source: Source, place: Path, tell: Tell) -> Path:
+    """The folder of its files."""
+    tree = place / "source"
+    tree.mkdir()
+    tell(f"fetching the source of {_title(source)}")
+    if source.commit:
+        download.check_out(source.url, source.commit, tree, tell)
+        return _below(tree, source)
+    archive = place / Path(unquote(urlsplit(source.url).path)).name
+    return apart.fetch(source.url, source.sha256, archive, tree, _title(source))
+
+
+def _below(tree: Path, source: Source) -> Path:
+    found = tree
+    for step in filter(None, source.subdirectory.split("/")):
+        if step in (".", "..") or not (found / step).is_dir():
+            raise DependencyError(
+                f"{_title(source)} has no folder {source.subdirectory[:200]!r}. {source.where}",
+                reason="requirement",
+            )
+        found = found / step
+    return found
+
+
+def _title(source: Source) -> str:
+    if source.commit:
+        return f"{source.name} ({without_login(source.url)}@{source.commit[:12]})"
+    return f"{source.name} {source.version}"
+
+
+@dataclass(frozen=True)
+class _Build:
+    """One source, unpacked."""
+
+    _source: Source
+    _project: project.Project
+    _tree: Path
+    _place: Path
+    _interpreter: Interpreter
+    _tell: Tell
+    _choose: Choose
+
+    def wheel(self) -> Path:
+        """Built, checked and kept. Raises ``DependencyError``."""
+        further: tuple[str, ...] = ()
+        while True:
+            try:
+                return self._tried(further)
+            except BuildFailedError as failed:
+                if not (more := self._remedy(str(failed), further)):
+                    raise self._failed(str(failed)) from failed
+                further = (*further, *more)
+
+    def _remedy(self, log: str, tried: tuple[str, ...]) -> tuple[str, ...]:
+        """Requirements with which it may be built after all; empty where there are none.
+
+        A program that it lacks may come as a wheel. And sources of years ago may not be read by
+        the setuptools of today: then one of theirs is tried.
+        """
+        program = project.wheel_for(log)
+        if program and program not in tried:
+            return (program,)
+        old = _old_tools(self._interpreter)
+        is_setuptools = self._project.backend.startswith("setuptools.")
+        return old if is_setuptools and not project.advice(log) and old[0] not in tried else ()
+
+    def _tried(self, further: tuple[str, ...]) -> Path:
+        known: tuple[str, ...] = ()
+        for number in range(_ROUNDS):
+            packages, lock = self._environment((*further, *known))
+            self._tell(f"building {_title(self._source)} in a jail")
+            folder = Path(tempfile.mkdtemp(prefix=f"try-{number}-", dir=self._place))
+            folder.chmod(0o755)
+            found = _in_jail(self._order(packages, known), folder)
+            if isinstance(found, Path):
+                source, interpreter = self._source, self._interpreter
+                apart.check_wheel(found, source.name, source.version, interpreter)
+                return wheels.keep(found, self._source, lock, self._interpreter)
+            known = (*known, *found)
+        raise BuildFailedError("its backend never has all that it needs")
+
+    def _environment(self, further: Iterable[str]) -> tuple[Path, str]:
+        """The folder of what it is built with, and the hash of that one's lock."""
+        where = f"what {_title(self._source)} is built with"
+        wanted = [*self._project.requires, *(parse_requirement(text, where) for text in further)]
+        if not wanted:
+            (self._place / "nothing").mkdir(exist_ok=True)
+            return self._place / "nothing", Lock("").digest
+        request = PackageRequest(where, tuple(wanted), runs_worker=False)
+        lock = self._choose(request, self._interpreter, self._tell)
+        return environments.provide(lock, self._interpreter, self._tell).packages, lock.digest
+
+    def _order(self, packages: Path, known: tuple[str, ...]) -> dict[str, object]:
+        # without ``.git`` nothing else says a version to those that ask git for it
+        version = {"SETUPTOOLS_SCM_PRETEND_VERSION": f"0+g{self._source.commit[:12]}"}
+        return {
+            "source": str(self._tree),
+            "packages": str(packages),
+            "python": self._interpreter.path,
+            "runtime": self._runtime(),
+            "backend": self._project.backend,
+            "backend_path": self._project.backend_path,
+            "known": (*(str(one.requirement) for one in self._project.requires), *known),
+            "environment": version if self._source.commit else {},
+        }
+
+    def _runtime(self) -> tuple[str, str]:
+        """What runs the jail's own code: here our own packages, else ones that are made."""
+        if self._interpreter == interpreters.own():
+            return OWN
+        lock = self._choose(
+            PackageRequest("the jail of a build", ()), self._interpreter, self._tell
+        )
+        environment = environments.provide(lock, self._interpreter, self._tell)
+        return environment.python, str(environment.packages)
+
+    def _failed(self, log: str) -> DependencyError:
+        source, said = self._source, project.advice(log)
+        needed_by = f" ({source.where})" if source.where else ""
+        return DependencyError(
+            f"{_title(source)}{needed_by} has no wheel for Python {self._interpreter.version}, and "
+            f"building its source in a jail failed. {said + '. ' if said else ''}The build says:\n"
+            f"{log}",
+            reason="resolution",
+        )
+
+
+def _old_tools(interpreter: Interpreter) -> tuple[str, ...]:
+    """What reads projects that are older than its checks, and brings ``pkg_resources``.
+
+    Before 66.1 no setuptools runs in Python 3.12.
+    """
+    old = tuple(map(int, interpreter.version.split(".")[:2])) < (3, 12)
+    return ("setuptools<66" if old else "setuptools<81", "wheel<0.40")

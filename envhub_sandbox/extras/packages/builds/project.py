@@ -1,0 +1,138 @@
+"""How sources say that they are built (PEP 517, 518), read as data, and what a build lacked."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.extras.packages.declared import WantedPackage, parse_requirement, pyproject
+
+_LEGACY = ("setuptools", "wheel")
+_LEGACY_BACKEND = "setuptools.build_meta:__legacy__"
+_MOST = 200
+
+
+@dataclass(frozen=True)
+class Project:
+    """What it is built with: packages, the backend (``module:object``), and folders of the sources
+    that the backend is looked for in first.
+    """
+
+    requires: tuple[WantedPackage, ...]
+    backend: str
+    backend_path: tuple[str, ...] = ()
+
+
+def read(tree: Path, title: str) -> Project:
+    """What the sources say; where they say nothing, setuptools builds them."""
+    where = f"[build-system] of {title}"
+    said = pyproject(tree, where).get("build-system", {})
+    if not isinstance(said, dict):
+        raise DependencyError(f"{where} is no table", reason="requirement")
+    requires = _texts(said.get("requires", list(_LEGACY)), where)
+    backend = said.get("build-backend", _LEGACY_BACKEND)
+    paths = _texts(said.get("backend-path", []), where)
+    if not isinstance(backend, str) or not all(
+        map(str.isidentifier, backend.replace(":", ".", 1).split("."))
+    ):
+        raise DependencyError(
+            f"{where}: {str(backend)[:200]!r} is not a build backend", reason="requirement"
+        )
+    return Project(tuple(parse_requirement(text, where) for text in requires), backend, paths)
+
+
+def _texts(found: object, where: str) -> tuple[str, ...]:
+    if not isinstance(found, list) or len(found) > _MOST:
+        raise DependencyError(f"{where} has no list of at most {_MOST} texts", reason="requirement")
+    if not all(isinstance(item, str) and item.isprintable() for item in found):
+        raise DependencyError(f"{where} holds something else than texts", reason="requirement")
+    return tuple(found)
+
+
+_PROGRAMS = {
+    "gcc": "gcc",
+    "cc": "gcc",
+    "g++": "g++",
+    "c++": "g++",
+    "clang": "clang",
+    "gfortran": "gfortran",
+    "cmake": "cmake",
+    "make": "make",
+    "ninja": "ninja-build",
+    "swig": "swig",
+    "cargo": "cargo",
+    "rustc": "rustc",
+    "go": "golang",
+    "pkg-config": "pkg-config",
+    "sdl2-config": "libsdl2-dev",
+    "git": "git",
+}
+_WHEELS = {"cmake": "cmake<4", "ninja": "ninja", "swig": "swig<5"}
+"""Those that PyPI has as wheels; CMake as old projects read it."""
+_HEADERS = {
+    "Python.h": "python3-dev",
+    "linux/input.h": "linux-libc-dev",
+    "SDL.h": "libsdl2-dev",
+    "GL/gl.h": "libgl1-mesa-dev",
+    "GL/osmesa.h": "libosmesa6-dev",
+    "ffi.h": "libffi-dev",
+    "zlib.h": "zlib1g-dev",
+    "stdio.h": "libc6-dev",
+}
+_PROGRAM_PATTERNS = (
+    r"command '([^'\s]+)' failed: No such file or directory",
+    r"unable to execute '([^'\s]+)': No such file",
+    r"No such file or directory: '([^'\s]+)'",
+    r"(?:^|\n)(?:/bin/)?sh: (?:\d+: |line \d+: )?([\w.+-]+): (?:command )?not found",
+    r"([\w+.-]+): command not found",
+    r"(?i)\b(cmake|swig|cargo|rustc|pkg-config|ninja)\b[^\n]{0,40}"
+    r"(?:must be installed|is required|not found|could not be found)",
+)
+_COMPILERS = re.compile(
+    r"No CMAKE_(C|CXX)_COMPILER could be found|Unknown compiler\(s\)|no acceptable C compiler"
+)
+_HEADER = re.compile(r"fatal error: ([\w./+-]{1,100}): No such file or directory")
+_LIBRARY = re.compile(r"cannot find -l([\w.+-]{1,60})")
+_NETWORK = re.compile(
+    r"Temporary failure in name resolution|Name or service not known|Network is unreachable"
+    r"|Could not resolve host|URLError|ConnectionError|Failed to establish a new connection"
+)
+
+
+def wheel_for(log: str) -> str:
+    """The package whose wheel brings the program that a build lacked; empty where none does."""
+    return _WHEELS.get(_program(log), "")
+
+
+def advice(log: str) -> str:
+    """What to install or to do, as one sentence; empty where nothing is recognised."""
+    if program := _program(log):
+        return f"It needs {program}, which is not found here. {_install(_PROGRAMS[program])}"
+    if _COMPILERS.search(log):
+        return f"It needs a C or C++ compiler, and none is found here. {_install('gcc g++')}"
+    if found := _HEADER.search(log):
+        package = _HEADERS.get(found[1], "")
+        how = _install(package) if package else "Install the development package that has it"
+        return f"It needs the header {found[1]}, which is not found here. {how}"
+    if library := _LIBRARY.search(log):
+        needs = f"It needs the library {library[1]}, which is not found here"
+        return f"{needs}. Install the development package that has it"
+    if _NETWORK.search(log):
+        return "It wants the network while it is built, and gets none"
+    return ""
+
+
+def _program(log: str) -> str:
+    for pattern in _PROGRAM_PATTERNS:
+        for found in re.finditer(pattern, log):
+            name = found[1].rpartition("/")[2].lower()
+            short = re.sub(r"^[a-z0-9_]+-linux-gnu-", "", name)
+            if short in _PROGRAMS:
+                return short
+    return ""
+
+
+def _install(package: str) -> str:
+    return f"On Debian and Ubuntu: apt-get install {package}"

@@ -1,0 +1,288 @@
+"""Wheels that came out of a jail: looked at as at any stranger's bytes, and then kept.
+
+Each is the package that was asked for, fits the interpreter, and holds what its RECORD says: files
+with these hashes, no links, nothing that leads out of a folder. What it does once it is installed
+is a jail's matter, as with every wheel of an index. They are kept by what they were built of::
+
+    <cache>/wheels/<source and interpreter>/<build environment>/
+        NAME-VERSION-TAGS.whl
+        built.json      what it was built of, and its hash
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import csv
+import hashlib
+import io
+import json
+import os
+import shutil
+import zipfile
+import zlib
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from packaging import tags
+from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
+from packaging.version import InvalidVersion, Version
+
+from envhub_sandbox.errors import DependencyError, SnapshotError
+from envhub_sandbox.extras.packages.builds.trees import (
+    MAX_TABLE,
+    BoundedStream,
+    check_zip,
+    not_as_expected,
+)
+from envhub_sandbox.extras.packages.declared import Source
+from envhub_sandbox.extras.packages.interpreters import Interpreter
+from envhub_sandbox.hub.listing import (
+    SHA256,
+    FileRecord,
+    HashMismatch,
+    check_listing_names,
+    copy_bounded,
+    digest_of,
+)
+from envhub_sandbox.hub.logins import without_login
+from envhub_sandbox.system import folders
+from envhub_sandbox.system.folders import cache_root, draft, remove_tree
+from envhub_worker.protocol.text import printable, size_text
+
+MAX_BYTES = 512 * 2**20
+MAX_UNPACKED = 4 * 2**30
+MAX_FILES = 100_000
+_UNREADABLE = (
+    *(OSError, EOFError, ValueError, RuntimeError, NotImplementedError, KeyError),
+    *(zipfile.BadZipFile, zlib.error, csv.Error),
+)
+
+
+@dataclass(frozen=True)
+class WheelOrigin:
+    """What a wheel was built of: its source, the digest of the lock of the packages that it was
+    built with, and its own SHA-256.
+    """
+
+    source: Source
+    environment: str
+    wheel: str
+
+
+def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> None:
+    """Refuse a wheel, under the name that its builder gave it, that is not what was asked for.
+
+    An empty version stands for any. Raises ``DependencyError``.
+    """
+    try:
+        found = named(wheel.name, name, version)
+        _fits(wheel.name, interpreter)
+        if wheel.stat().st_size > MAX_BYTES:
+            raise not_as_expected(f"it has more than {size_text(MAX_BYTES)}")
+        with (
+            wheel.open("rb") as file,
+            zipfile.ZipFile(BoundedStream(file, "it", MAX_TABLE)) as archive,
+        ):
+            _files(archive)
+            info = _info(archive, name, found)
+            _record(archive, f"{info}/RECORD")
+    except (*_UNREADABLE, SnapshotError, DependencyError) as error:
+        said = printable(str(error), 300)
+        raise not_as_expected(
+            f"the wheel {printable(wheel.name, 200)!r} that was built for {name} is not taken: "
+            f"{said}"
+        ) from error
+
+
+def named(file: str, name: str, version: str) -> Version:
+    """The version of a wheel, by the name of its file. Raises ``DependencyError``."""
+    try:
+        found, number, _, _ = parse_wheel_filename(file)
+        wanted = Version(version) if version else number
+    except (InvalidWheelFilename, InvalidVersion) as error:
+        raise not_as_expected(f"its name says nothing: {error}") from error
+    if found != canonicalize_name(name) or number != wanted:
+        raise not_as_expected(f"it is {found} {number}, and not {name} {wanted}")
+    return number
+
+
+def _fits(file: str, interpreter: Interpreter) -> None:
+    _, _, _, found = parse_wheel_filename(file)
+    major, minor = map(int, interpreter.version.split(".")[:2])
+    platforms = list(tags.platform_tags())  # it was built on this machine
+    short = f"cp{major}{minor}"
+    fitting = {
+        *tags.cpython_tags((major, minor), platforms=platforms),
+        *tags.compatible_tags((major, minor), interpreter=short, platforms=platforms),
+    }
+    if fitting.isdisjoint(found):
+        raise not_as_expected(f"it does not fit Python {interpreter.version} on this machine")
+
+
+def _files(archive: zipfile.ZipFile) -> None:
+    members = archive.infolist()
+    if len(members) > MAX_FILES or sum(one.file_size for one in members) > MAX_UNPACKED:
+        raise not_as_expected(f"it holds more than {MAX_FILES} files or {size_text(MAX_UNPACKED)}")
+    check_zip(members, "it")
+    names = (one.filename + "_" * one.is_dir() for one in members)  # a folder as a file in it
+    check_listing_names([FileRecord(name, 0, "") for name in names], "it")
+
+
+def _info(archive: zipfile.ZipFile, name: str, version: Version) -> str:
+    """Its one ``.dist-info``, which is that of the package and of the version."""
+    tops = {one.partition("/")[0] for one in archive.namelist()}
+    found = [top for top in tops if top.endswith(".dist-info")]
+    if len(found) != 1:
+        raise not_as_expected(f"it holds {len(found)} folders .dist-info")
+    stem, _, number = found[0].removesuffix(".dist-info").rpartition("-")
+    if canonicalize_name(stem) != canonicalize_name(name) or Version(number) != version:
+        raise not_as_expected(f"its metadata are those of {found[0]!r}")
+    fields = _fields(_small(archive, f"{found[0]}/METADATA"))
+    if canonicalize_name(fields.get("name", "")) != canonicalize_name(name):
+        raise not_as_expected(f"its metadata name the package {fields.get('name', '')!r}")
+    if Version(fields.get("version", "")) != version:
+        raise not_as_expected(f"its metadata name the version {fields.get('version', '')!r}")
+    return found[0]
+
+
+def _fields(data: bytes) -> dict[str, str]:
+    """The headers of METADATA; of each name the first."""
+    fields: dict[str, str] = {}
+    for line in data.decode("utf-8", "replace").splitlines():
+        if not line.strip():
+            break
+        key, colon, value = line.partition(":")
+        if colon and not line[0].isspace():
+            fields.setdefault(key.lower(), value.strip())
+    return fields
+
+
+def _small(archive: zipfile.ZipFile, path: str) -> bytes:
+    with archive.open(path) as file:
+        data = file.read(MAX_TABLE + 1)
+    if len(data) > MAX_TABLE:
+        raise not_as_expected(f"{path} in it has more than {size_text(MAX_TABLE)}")
+    return data
+
+
+def _record(archive: zipfile.ZipFile, path: str) -> None:
+    """Every file is in RECORD with its hash, and RECORD names no other."""
+    rows = list(csv.reader(io.StringIO(_small(archive, path).decode())))
+    said = {row[0]: row[1] for row in rows if len(row) == 3}
+    there = {one.filename for one in archive.infolist() if not one.is_dir()}
+    signatures = {path, f"{path}.jws", f"{path}.p7s"}
+    if there - said.keys() - signatures or said.keys() - there - signatures:
+        raise not_as_expected("its RECORD lists other files than it has")
+    for name in sorted(there - signatures):
+        if said[name] != _digest(archive, name):
+            raise not_as_expected(f"{name[:200]!r} is not the file that its RECORD says")
+
+
+def _digest(archive: zipfile.ZipFile, name: str) -> str:
+    digest = hashlib.sha256()
+    with archive.open(name) as file:  # which gives no more than it says
+        copy_bounded(file, None, archive.getinfo(name).file_size, digest)
+    return "sha256=" + base64.urlsafe_b64encode(digest.digest()).rstrip(b"=").decode()
+
+
+FORMAT = 2
+"""Of what is kept, and of how it is built: another one is built again."""
+
+
+def root() -> Path:
+    """Where they lie; ours alone, since what lies there is installed."""
+    return cache_root() / "wheels"
+
+
+def recall(source: Source, interpreter: Interpreter) -> Path | None:
+    """The wheel of a source that was built last for an interpreter; None where there is none."""
+    place = root() / _key(source, interpreter)
+    if not place.is_dir() or not folders.is_ours_alone(root()):
+        return None
+    records = sorted(place.glob("[!.]*/built.json"), key=lambda one: -one.stat().st_mtime)
+    return next(filter(None, map(_whole, records)), None)
+
+
+def _whole(record: Path) -> Path | None:
+    """The wheel beside a record, if it is what that one says."""
+    with contextlib.suppress(OSError, ValueError, HashMismatch):
+        [wheel] = record.parent.glob("*.whl")
+        built = describe(wheel)
+        if built is not None and _hash(wheel) == f"sha256:{built.wheel}":
+            with contextlib.suppress(OSError):
+                os.utime(record)
+            return wheel
+    return None
+
+
+@dataclass(frozen=True)
+class KeptWheel:
+    """A wheel that was built here; ``used``: Unix time (seconds) when it was last asked for."""
+
+    file: str
+    size: int
+    used: float
+    home: Path
+
+    def answers_to(self, name: str) -> bool:
+        """Whether a name means it: its file's, or that of its package."""
+        return name == self.file or canonicalize_name(name) == parse_wheel_filename(self.file)[0]
+
+    def remove(self) -> None:
+        """It is built again where it is needed."""
+        remove_tree(self.home)
+        with contextlib.suppress(OSError):  # of another build environment there is one more
+            self.home.parent.rmdir()
+
+
+def every() -> list[KeptWheel]:
+    """All of them, the latest used first."""
+    found = []
+    for record in root().glob("*/[!.]*/built.json"):
+        with contextlib.suppress(OSError, ValueError):
+            [wheel] = record.parent.glob("*.whl")
+            parse_wheel_filename(wheel.name)
+            size, used = wheel.stat().st_size, record.stat().st_mtime
+            found.append(KeptWheel(wheel.name, size, used, record.parent))
+    return sorted(found, key=lambda one: -one.used)
+
+
+def describe(wheel: Path) -> WheelOrigin | None:
+    """What a wheel was built of; None for one that was not built here."""
+    with contextlib.suppress(OSError, ValueError, TypeError, LookupError):
+        facts = json.loads((wheel.parent / "built.json").read_bytes())
+        return WheelOrigin(Source(**facts["source"]), facts["environment"], facts["wheel"])
+    return None
+
+
+def keep(wheel: Path, source: Source, environment: str, interpreter: Interpreter) -> Path:
+    """Keep a wheel that was checked, and return where it lies. Raises ``DependencyError``."""
+    place = root() / _key(source, interpreter)
+    public = replace(source, url=without_login(source.url), where="")
+    built = WheelOrigin(public, environment, _hash(wheel).removeprefix("sha256:"))
+    try:
+        folders.make_private(root())
+        folders.make(place)
+        with draft(place) as building:
+            shutil.copyfile(wheel, building / wheel.name)
+            (building / "built.json").write_text(json.dumps(asdict(built)))
+            home = place / environment[:40]
+            if home.exists() and _whole(home / "built.json") is None:
+                remove_tree(home)
+            with contextlib.suppress(OSError):  # one that another has put there is as good
+                os.rename(building, home)
+    except OSError as error:
+        raise DependencyError(f"{root()} cannot be written: {error}") from error
+    kept = recall(source, interpreter)
+    assert kept is not None
+    return kept
+
+
+def _key(source: Source, interpreter: Interpreter) -> str:
+    facts = json.dumps([FORMAT, source.identity, asdict(interpreter)])
+    return hashlib.sha256(facts.encode()).hexdigest()[:40]
+
+
+def _hash(wheel: Path) -> str:
+    return digest_of(wheel, SHA256, wheel.stat().st_size)

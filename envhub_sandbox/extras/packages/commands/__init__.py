@@ -1,0 +1,1 @@
+"""``envhub lock``, and ``envhub inspect --download``."""

@@ -1,0 +1,271 @@
+"""The program by which ``envhub-worker listen --dependencies`` makes clients' packages.
+
+``python -I -m envhub_sandbox.extras.packages.for_a_server --server-pidfd=N``: stdin is one order as
+JSON, stdout a file that holds the present state, as one object of JSON: ``progress``, a line for
+people; and at the end ``own``, ``made``, or ``error`` and ``said``. With the word ``check`` it only
+says whether it could work.
+
+An order comes from a client on another host, and nothing of it is believed: requirements are
+read as a stranger's file is. What is made lies in a folder of that client's key, uv's cache
+included, and all of it has one bound. So two processes are at it: one works, and this one measures,
+ends it, and leaves nothing of what was not finished. Each has a pidfd of the one that started it,
+and ends with it, also where that was killed: the work would be neither measured nor waited for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from packaging.utils import canonicalize_name
+
+from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.extras.packages import bounds, environments, packages
+from envhub_sandbox.extras.packages.declared import WantedPackage, check_versions, parse_requirement
+from envhub_sandbox.extras.packages.modules import Guess
+from envhub_sandbox.extras.packages.request import DATE, PackageRequest
+from envhub_sandbox.extras.packages.resolution import resolutions, uv
+from envhub_sandbox.system import locks
+from envhub_sandbox.system.folders import CACHE_VARIABLE, remove_tree
+from envhub_sandbox.system.platform import end_with, pidfd, program
+from envhub_worker.protocol.text import printable
+
+BLOCK_BYTES = 4096
+"""What the smallest file is charged: it takes disk, too."""
+_LOOK_S = 0.5
+_WAIT_S = 60.0
+_LOCKED_S = 1800.0
+"""For so long another server of this machine may be at work, where both share the folder."""
+_CLEANING_S = 2 * _WAIT_S
+_WHERE_CHARS = 200
+_SAID_CHARS = 3800
+_NICE = 10
+_PROGRAM = "envhub_sandbox.extras.packages.for_a_server"
+_PIDFD = "--server-pidfd="
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Carry out an order; the exit code is 0 if something was said that can be read."""
+    words = sys.argv[1:] if words is None else words
+    try:
+        if "check" in words:
+            uv.command()
+            return 0
+        given = [word.partition("=")[2] for word in words if word.startswith(_PIDFD)]
+        ended = int(given[0]) if given else None  # of the process which started this one
+        order = json.load(sys.stdin)
+        os.environ[CACHE_VARIABLE] = order["folder"]
+        os.environ["UV_CACHE_DIR"] = str(_uv_cache(order))
+        os.environ[bounds.BYTES_VARIABLE] = str(order["bytes"])
+        said = _made(order, ended) if "make" in words else _watched(order, ended)
+    except DependencyError as error:
+        if "check" in words:
+            sys.stderr.write(f"{error}\n")
+            return 1
+        said = {"error": error.reason, "said": str(error)[:_SAID_CHARS]}
+    if said:
+        _say(said)
+    return 0
+
+
+def _say(what: Mapping[str, Any]) -> None:
+    os.ftruncate(1, 0)
+    os.pwrite(1, json.dumps(what).encode(), 0)
+
+
+# --- who works ----------------------------------------------------------------------------------
+
+
+def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
+    if ended is not None:
+        end_with(ended, 0.0)  # uv is in our group, too
+    os.nice(_NICE)
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)  # which a plain user cannot raise
+    bound = order["bytes"] if most == resource.RLIM_INFINITY else min(order["bytes"], most)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (bound, bound))
+    request = _request(order)
+    # a client could have it ask any host that it reaches, and what a build takes is in no account
+    resolutions.BUILDER = None
+    if not request.always and packages.HERE.meets(request):
+        return {"own": True}
+    made = packages.HERE.make(request, lambda line: _say({"progress": line[:_WHERE_CHARS]}))
+    assert made.environment is not None
+    return {
+        "made": {
+            "name": made.environment.key,
+            "python": made.python,
+            "packages": made.packages,
+            "bytes": made.environment.size,
+            "facts": made.facts,
+        }
+    }
+
+
+def _request(order: Mapping[str, Any]) -> PackageRequest:
+    """What is asked for. Trust: input from a client."""
+    python, until = order["python"], order["exclude_newer"]
+    try:
+        check_versions(python or ">=3")
+        check_versions(order["supports"] or ">=3")
+        if os.sep in python + order["supports"] or (until and not re.fullmatch(DATE, until)):
+            raise ValueError("a path, or no date")
+    except ValueError as error:
+        raise DependencyError(
+            "the client asks for versions of Python that are none, for an interpreter by its path, "
+            "or for a date that is none",
+            reason="requirement",
+        ) from error
+    left_out = ((name, "without, of the client") for [name] in order["without"])
+    return PackageRequest(
+        "what the client asks for",
+        _wanted(order["requirements"]),
+        supports=order["supports"],
+        python=python,
+        exclude_newer=until or None,
+        always=order["always"],
+        guesses=tuple(
+            Guess(module, _wanted([row])[0], tuple(map(canonicalize_name, names.split())))
+            for *row, module, names in order["guesses"]
+        ),
+        constraints=_wanted(order["constraints"]),
+        override=_wanted(order["override"]),
+        without=tuple(one.requirement.name for one in _wanted(left_out)),
+        gpu=order["gpu"],
+    )
+
+
+def _wanted(rows: Iterable[Sequence[str]]) -> tuple[WantedPackage, ...]:
+    return tuple(parse_requirement(text, printable(where, _WHERE_CHARS)) for text, where in rows)
+
+
+# --- who watches --------------------------------------------------------------------------------
+
+
+def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
+    """Have it made, within bounds; empty where the process that made it has written the answer."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    if ended is not None:
+        end_with(ended, _CLEANING_S)
+    with _alone(Path(order["folder"])) as held:
+        unfinished = Path(order["folder"], "unfinished")
+        if unfinished.exists():
+            _clean(order)  # the process that made it was killed
+        _make_room(order)
+        unfinished.touch()
+        try:
+            finished = _worked(order, held)
+        except BaseException:
+            _clean(order)
+            unfinished.unlink()
+            raise
+        if not finished or _charged(_uv_cache(order)) > order["bytes"] // 4:
+            _clean(order)
+        unfinished.unlink()
+    return {}
+
+
+def _worked(order: Mapping[str, Any], held: int) -> bool:
+    """Whether it has come to an end that leaves nothing half-made."""
+    with pidfd() as ourselves:
+        process = subprocess.Popen(
+            [*program(_PROGRAM), "make", f"{_PIDFD}{ourselves}"],
+            stdin=subprocess.PIPE,
+            pass_fds=(held, ourselves),
+            start_new_session=True,  # uv is in it, too
+        )
+    try:
+        assert process.stdin is not None
+        with contextlib.suppress(BrokenPipeError), process.stdin as stdin:
+            stdin.write(json.dumps(order).encode())
+        while process.poll() is None:
+            _look(order)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(_LOOK_S)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    if process.returncode != 0:
+        raise DependencyError(f"the program that makes packages ended with {process.returncode}")
+    return "error" not in json.loads(os.pread(1, 1 << 20, 0) or b"{}")
+
+
+def _look(order: Mapping[str, Any]) -> None:
+    charged = _charged(Path(order["folder"]))
+    if charged > order["bytes"]:
+        raise DependencyError(
+            f"the packages of your key have {charged / 2**20:,.0f} MiB there, what is downloaded "
+            f"for them included; the server's quota is {order['bytes'] / 2**20:,.0f} MiB "
+            "(--max-packages). Nothing was installed",
+            reason="size",
+        )
+
+
+def _charged(folder: Path) -> int:
+    """Bytes of all that is below a folder, a block at least for each file."""
+    total = 0
+    for path in bounds.walk(folder):
+        with contextlib.suppress(OSError):
+            total += max(path.lstat().st_size, BLOCK_BYTES)
+    return total
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[int]:
+    """Hold the lock of a client's folder: a killed server may have left a process there."""
+    folder.mkdir(parents=True, exist_ok=True)
+
+    waits = {"progress": "waiting for another process, which makes packages there"}
+    lock = locks.held(folder / "lock", wait_s=_LOCKED_S, on_wait=lambda: _say(waits))
+    with contextlib.ExitStack() as stack:
+        try:
+            descriptor = stack.enter_context(lock)
+        except TimeoutError:
+            raise DependencyError("another process is making packages there; try again") from None
+        yield descriptor
+
+
+def _uv_cache(order: Mapping[str, Any]) -> Path:
+    return Path(order["folder"], "uv")
+
+
+def _clean(order: Mapping[str, Any]) -> None:
+    """Remove what was not finished, and all that uv has unpacked: some of it may be what broke.
+
+    A uv that was killed a moment ago still holds its lock until the kernel has ended it.
+    """
+    until = time.monotonic() + _WAIT_S
+    while True:
+        environments.remove_abandoned()
+        remove_tree(_uv_cache(order))
+        left = environments.half_made() or _uv_cache(order).exists()
+        if not left or time.monotonic() > until:
+            return
+        time.sleep(_LOOK_S)
+
+
+def _make_room(order: Mapping[str, Any]) -> None:
+    """Half of the bound at least is for what comes: what was not used for longest goes."""
+    folder, keep = Path(order["folder"]), frozenset[str](order["keep"])
+    if _charged(folder) > order["bytes"] // 2:
+        remove_tree(_uv_cache(order))
+        remove_tree(folder / "resolutions")
+    removable = [one for one in reversed(environments.every()) if one.key not in keep]
+    for environment in removable:
+        if _charged(folder) <= order["bytes"] // 2:
+            return
+        environments.remove(environment)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,137 @@
+"""When a repository was written: packages of later may have broken it, and those of then cure it.
+
+A date is somebody's word and no more: it decides which releases of packages a jail gets.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from dataclasses import replace
+from datetime import date, datetime, timedelta, timezone
+from pathlib import Path
+
+from envhub_sandbox.errors import (
+    DependencyError,
+    EnvHubError,
+    LoadError,
+    PolicyError,
+    RemoteEnvError,
+)
+from envhub_sandbox.extras.packages.request import AS_WRITTEN, Choice
+from envhub_sandbox.extras.sources import registered
+from envhub_sandbox.hub import store
+from envhub_sandbox.hub.answers import HubFailure
+from envhub_sandbox.hub.grammar import REPO_TYPES
+from envhub_sandbox.hub.listing import Repository
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.settings.options import option_name
+
+_OUTDATED = re.compile(
+    r"has no attribute|unexpected keyword argument|required positional|positional arguments?\b|"
+    r"cannot import name|No module named '\w+\.|"
+    r"(?i:\b(?:removed|renamed|moved to|no longer|deprecated)\b)"
+)
+_BROKEN_BY = {
+    r"removed in the NumPy 2\.0 release": "numpy<2",
+    r"module 'numpy' has no attribute '(bool|complex|float|int|object|str)'": "numpy<1.24",
+}
+"""What a date may not cure, since the release was there already: by what is said then."""
+_RECENT = timedelta(days=30)
+_MOST_DATES, _MOST_TEXT = 4, 65_536
+
+
+def of_its_day(snapshot: Snapshot, error: EnvHubError) -> str:
+    """What to do about an error at a start that packages of the repository's day may cure; empty
+    for others, and for what is of today.
+    """
+    said = _said_at_start(error)
+    for pattern, requirement in _BROKEN_BY.items():
+        if re.search(pattern, said):
+            older = option_name("dependencies", {"override": [requirement]})
+            return f"A later release of a package has broken it; {older} takes an earlier one"
+    days = days_for(snapshot, error)
+    if not days:
+        return ""
+    old = option_name("dependencies", {"exclude_newer": days[0]})
+    return (
+        f"It is of {days[0]}. If packages have changed since, {old} gives it those of that day; "
+        "'envhub check' looks for a later day that does"
+    )
+
+
+def settled(snapshot: Snapshot, choice: Choice) -> Choice:
+    """The choice with a date for ``"auto"``. Raises ``PolicyError``: it is not known."""
+    if choice.exclude_newer != AS_WRITTEN:
+        return choice
+    if day := written(snapshot):
+        return replace(choice, exclude_newer=day)
+    raise PolicyError(
+        f"{snapshot.label}: the day on which it was written is not known; give a date, as in "
+        f"{option_name('dependencies', {'exclude_newer': '2026-01-31'})}"
+    )
+
+
+def written(snapshot: Snapshot) -> str:
+    """The day of its commit, its release or its newest file, ``"2024-05-31"``; empty if unknown."""
+    found = ""
+    with contextlib.suppress(EnvHubError, HubFailure, OSError, ValueError, LookupError):
+        if snapshot.is_local:
+            found = _of_files(snapshot)
+        elif snapshot.repo_type == registered.KIND:
+            found = _of_release(snapshot)
+        elif snapshot.repo_type in REPO_TYPES:
+            found = _of_commit(snapshot)
+        return date.fromisoformat(found).isoformat()
+    return ""
+
+
+def days_for(snapshot: Snapshot, error: EnvHubError) -> list[str]:
+    """The day on which it was written, and a few later ones, each nearer to today by half: those
+    whose packages may cure an error.
+    """
+    day = written(snapshot) if _OUTDATED.search(_said_at_start(error)) else ""
+    now = datetime.now(timezone.utc)
+    then = datetime.fromisoformat(day or now.date().isoformat()).replace(tzinfo=timezone.utc)
+    found: list[str] = []
+    while now - then > _RECENT and len(found) < _MOST_DATES:
+        found.append(then.date().isoformat())
+        then += (now - then) / 2
+    return found
+
+
+def _said_at_start(error: EnvHubError) -> str:
+    """What code raised as it was loaded or reset; empty for any other error.
+    Trust: text from the worker, by which one of our sentences is chosen.
+    """
+    remote = error if isinstance(error, RemoteEnvError) else error.__cause__
+    if not isinstance(remote, RemoteEnvError):
+        return ""
+    starts = isinstance(error, (LoadError, DependencyError)) or ", in reset" in remote.traceback
+    return f"{remote.type_name}: {remote.message}"[:_MOST_TEXT] if starts else ""
+
+
+def _of_files(snapshot: Snapshot) -> str:
+    folder = Path(snapshot.repo_id)
+    paths = [folder / one.path for one in snapshot.files] if folder.is_dir() else [folder]
+    newest = max(os.stat(path).st_mtime for path in paths)
+    return datetime.fromtimestamp(newest, timezone.utc).strftime("%Y-%m-%d")
+
+
+def _of_release(snapshot: Snapshot) -> str:
+    from envhub_sandbox.extras.packages import interpreters
+    from envhub_sandbox.extras.packages.declared import declared
+    from envhub_sandbox.extras.packages.resolution import resolve
+
+    says = declared(snapshot.root, snapshot.path)
+    assert says is not None  # the entry file is ours
+    return resolve.uploaded(says.wanted[0], interpreters.own().path)
+
+
+def _of_commit(snapshot: Snapshot) -> str:
+    from envhub_sandbox.hub.client import HubClient
+
+    repo = Repository(snapshot.repo_type, snapshot.repo_id)
+    # only where it is from: the name of a private repository is nobody else's
+    return HubClient(store.endpoint_of(snapshot.root)).changed(repo, snapshot.commit)

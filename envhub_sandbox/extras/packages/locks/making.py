@@ -1,0 +1,265 @@
+"""Makes lock files of what is there now, and says what differs from one: drift."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from envhub_sandbox.errors import LockDriftError, LockError
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.declared import WantedPackage, parse_requirement
+from envhub_sandbox.extras.packages.locks import lockfile, pylock
+from envhub_sandbox.extras.packages.locks.day import settled
+from envhub_sandbox.extras.packages.locks.lockfile import (
+    LOCAL,
+    LockFile,
+    Runner,
+    Spaces,
+    TaskFingerprint,
+    repository_of,
+)
+from envhub_sandbox.extras.packages.locks.pylock import PylockPackage
+from envhub_sandbox.extras.packages.request import Choice, request_of
+from envhub_sandbox.extras.packages.resolution.resolutions import resolution_for
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_worker.protocol.spaces.spaces import encode_space
+from envhub_worker.protocol.text import printable
+
+_SHOWN = 30
+_TEXT = 200
+
+
+def differences(then: LockFile, now: LockFile) -> list[str]:
+    """Whatever differs, a line each."""
+    runner = f"Python: {then.runner} was locked, this is {now.runner}"
+    spaces: Iterator[str] = iter(())
+    if then.spaces and now.spaces and then.spaces.arguments == now.spaces.arguments:
+        spaces = drift_of_tasks(then.spaces.tasks, now.spaces.tasks)
+    return [
+        *_of_files(then, now),
+        *([runner] if then.runner != now.runner else []),
+        *_of_packages(then.packages, now.packages),
+        *spaces,
+    ]
+
+
+def refuse(found: Sequence[str], label: str) -> None:
+    """Raise ``LockDriftError`` if anything has drifted."""
+    if not found:
+        return
+    more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
+    lines = "\n".join(f"  {line}" for line in [*found[:_SHOWN], *more])
+    raise LockDriftError(
+        f"{label}: differs from its lock:\n{lines}\nUse what was locked, or lock the present "
+        "state: envhub lock --upgrade REF",
+        tuple(found),
+    )
+
+
+def with_files(lock: LockFile, snapshot: Snapshot) -> LockFile:
+    """The same with the files of a snapshot."""
+    return replace(
+        lock,
+        repository=repository_of(snapshot),
+        commit=snapshot.commit,
+        entry=snapshot.path,
+        files={record.path: record.digest for record in snapshot.files},
+        assets=tuple(one.pinned for one in snapshot.assets),
+    )
+
+
+def _of_files(then: LockFile, now: LockFile) -> Iterator[str]:
+    if then.repository != now.repository:
+        both = (then.repository, now.repository)
+        names = ["a local folder" if one == LOCAL else one for one in both]
+        yield f"repository: {names[0]} was locked, this is {names[1]}"
+    if then.commit != now.commit:
+        yield f"commit: {then.commit[:18]} was locked, this is {now.commit[:18]}"
+    if then.entry != now.entry:
+        yield f"entry file: {then.entry} was locked, this is {now.entry}"
+    if set(then.assets) != set(now.assets):
+        old, new = (", ".join(sorted(one.assets)) or "none" for one in (then, now))
+        yield f"assets: {printable(old, 2000)} were locked, these are {printable(new, 2000)}"
+    for name in sorted({*then.files, *now.files}):
+        shown = printable(name, 200)
+        if name not in now.files:
+            yield f"file {shown}: gone"
+        elif name not in then.files:
+            yield f"file {shown}: new"
+        elif then.files[name] != now.files[name]:
+            yield f"file {shown}: other content"
+
+
+def _of_packages(then: Sequence[PylockPackage], now: Sequence[PylockPackage]) -> Iterator[str]:
+    before, after = ({one.name: one for one in packages} for packages in (then, now))
+    for name in sorted({*before, *after}):
+        old, new = before.get(name), after.get(name)
+        if old is None and new is not None:
+            yield f"package {name}: new, {new.version}"
+        elif new is None and old is not None:
+            yield f"package {name}: gone, {old.version} was locked"
+        elif old is not None and new is not None:
+            yield from _of_package(old, new)
+
+
+def _of_package(then: PylockPackage, now: PylockPackage) -> Iterator[str]:
+    if then.version != now.version:
+        yield f"package {then.name}: {then.version} was locked, this is {now.version}"
+        return
+    before, after = (one.origin.source.identity if one.origin else "" for one in (then, now))
+    if before != after:
+        yield f"package {then.name}: built of {before or 'no source'}, this of {after or 'none'}"
+    there = {wheel.sha256 for wheel in now.wheels}
+    for wheel in then.wheels:
+        if wheel.sha256 not in there:
+            others = ", ".join(sorted(one[:12] for one in there)) or "none"
+            yield (
+                f"package {then.name}=={then.version}: the file with SHA-256 "
+                f"{wheel.sha256[:12]}... was locked, there is {others}"
+            )
+
+
+def drift_of_tasks(
+    then: Sequence[TaskFingerprint], now: Sequence[TaskFingerprint]
+) -> Iterator[str]:
+    """What differs in environments."""
+    before, after = ({task.name: task for task in tasks} for tasks in (then, now))
+    for name in sorted({*before, *after}):
+        old, new, shown = before.get(name), after.get(name), printable(name, 200)
+        if old is None or new is None:
+            yield f"environment {shown}: {'new' if old is None else 'gone'}"
+            continue
+        if old.mode != new.mode:
+            yield f"environment {shown}: autoreset mode {old.mode or 'none'}, now {new.mode}"
+        if old.spaces != new.spaces:
+            said = [
+                f"{what} were {before}, now {after}"
+                for what, before, after in (
+                    ("observations", old.observations, new.observations),
+                    ("actions", old.actions, new.actions),
+                )
+                if before != after
+            ]
+            text = "; ".join(said) or "other bounds or types in its spaces, which read the same"
+            yield f"environment {shown}: {text}"
+
+
+def locked(snapshot: Snapshot, choice: Choice, *, upgrade: bool = False) -> LockFile:
+    """A lock of a repository with the packages of a choice; nothing of either runs."""
+    request = request_of(snapshot, replace(settled(snapshot, choice), where="own"))
+    assert request is not None  # which only another choice gives
+    found = resolution_for(request, upgrade=upgrade)
+    empty = LockFile(
+        *("", "", "", {}, Runner.of(found.interpreter)),
+        packages=pylock.described(found.lock, found.interpreter.path),
+        extra=tuple(map(str, choice.extra)),
+        only=None if choice.only is None else tuple(map(str, choice.only)),
+        override=tuple(map(str, choice.override)),
+        without=choice.without,
+        inferred=tuple(
+            f"{one.wanted.requirement} ({one.wanted.where})"
+            for one in request.guesses
+            if one.module in found.taken
+        ),
+        exclude_newer=request.exclude_newer,
+    )
+    return with_files(empty, snapshot)
+
+
+def again(lock: LockFile) -> Choice:
+    """The choice that led to a lock."""
+    return Choice(
+        "own",
+        _parsed(lock.extra),
+        lock.runner.python,
+        lock.exclude_newer,
+        infer=lock.only is None,
+        only=None if lock.only is None else _parsed(lock.only),
+        without=lock.without,
+        override=_parsed(lock.override),
+    )
+
+
+def _parsed(texts: Sequence[str]) -> tuple[WantedPackage, ...]:
+    return tuple(parse_requirement(text, f"{text[:80]!r} in the lock") for text in texts)
+
+
+def relisted(lock: LockFile) -> LockFile:
+    """The same with the files that the index has of its packages now."""
+    built = [one for one in lock.packages if one.origin is not None]
+    pins = [f"{one.name}=={one.version}" for one in lock.packages if one.origin is None]
+    interpreter = interpreters.find(lock.runner.python)
+    options = pylock.pins(lock.packages).options
+    found = pylock.listed(pins, interpreter.path, options, refresh=True)
+    packages = tuple(sorted((*built, *found), key=lambda one: one.name))
+    return replace(lock, packages=packages)
+
+
+def with_spaces(
+    lock: LockFile, env_kwargs: Mapping[str, Any], suites: Mapping[str, Mapping[Any, Any]]
+) -> LockFile:
+    """The same with what a repository's ``make_env`` returned for these arguments."""
+    arguments = lockfile.arguments_text(env_kwargs)
+    if arguments is None:
+        raise LockError("env_kwargs have values that a lock cannot record")
+    return replace(lock, spaces=Spaces(arguments, tasks_of(suites)))
+
+
+def tasks_of(suites: Mapping[str, Mapping[Any, Any]]) -> tuple[TaskFingerprint, ...]:
+    """What a repository's ``make_env`` returned, in a form that can be compared."""
+    found = []
+    for suite, tasks in suites.items():
+        for task, env in tasks.items():
+            mode = env.metadata.get("autoreset_mode")
+            spaces = env.single_observation_space, env.single_action_space
+            found.append(fingerprint_of_task(suite, task, getattr(mode, "value", mode), *spaces))
+    return tuple(found)
+
+
+def fingerprint_of_task(
+    suite: str,
+    task: int | str,
+    mode: str | None,
+    observations: gym.Space[Any],
+    actions: gym.Space[Any],
+) -> TaskFingerprint:
+    """What is to be remembered of an environment. Trust: input from the worker, already checked."""
+    spaces = fingerprint_of_spaces(observations, actions)
+    texts = (" ".join(str(one).split()) for one in (observations, actions))
+    seen, done = (printable(text, _TEXT).replace("\n", " ") for text in texts)
+    return TaskFingerprint(suite, task, mode or "", seen, done, spaces)
+
+
+def fingerprint_of_spaces(*spaces: gym.Space[Any]) -> str:
+    """A hash of spaces: of their kinds, shapes, dtypes and bounds, and of no generator's state."""
+    digest = hashlib.sha256()
+    for space in spaces:
+        _add(digest, encode_space(space))
+    return f"sha256:{digest.hexdigest()}"
+
+
+def _add(digest: Any, value: object) -> None:
+    """Each value with its kind and length before it, so that no two look alike."""
+    if isinstance(value, dict):
+        if value.get("kind") == "opaque":  # its text may hold an address
+            value = {name: item for name, item in value.items() if name != "text"}
+        digest.update(f"dict {len(value)};".encode())
+        for key, item in value.items():  # the order of a Dict space is part of it
+            _add(digest, key)
+            _add(digest, item)
+    elif isinstance(value, (list, tuple)):
+        digest.update(f"list {len(value)};".encode())
+        for item in value:
+            _add(digest, item)
+    elif isinstance(value, (np.ndarray, np.generic)):
+        array = np.ascontiguousarray(value)
+        plain = array.astype(array.dtype.newbyteorder("<"), copy=False)
+        digest.update(f"array {plain.dtype.str} {np.shape(value)};".encode() + plain.tobytes())
+    else:
+        data = repr(value).encode("utf-8", "backslashreplace")
+        digest.update(f"{type(value).__name__} {len(data)};".encode() + data)

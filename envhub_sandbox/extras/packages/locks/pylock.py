@@ -1,0 +1,262 @@
+"""The part of a lock file that is a standard, https://peps.python.org/pep-0751/, as data.
+
+uv writes it for the pins, and what it wrote is read, checked and printed anew. Nothing of a lock
+file is ever handed to uv as it stands: only names, versions and hashes of these forms get through.
+
+A package without a wheel on the index is held to its source, which is fetched and hashed again. The
+hash of the wheel that was built says whether the next build gives the same bytes; compilers of two
+machines do not.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeGuard
+
+from packaging.requirements import InvalidRequirement, Requirement
+from packaging.version import InvalidVersion, Version
+
+from envhub_sandbox.errors import DependencyError, LockError
+from envhub_sandbox.extras.packages.builds.wheels import WheelOrigin, describe
+from envhub_sandbox.extras.packages.declared import Source, of_git
+from envhub_sandbox.extras.packages.resolution import index, uv
+from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target, torch_options
+from envhub_sandbox.hub.logins import without_login
+from envhub_sandbox.hub.sources import toml
+from envhub_sandbox.hub.sources.toml import table
+
+MAX_CHARACTERS = 16 * 1024 * 1024
+MAX_PACKAGES = 2000
+MAX_WHEELS = 200
+"""Of one package: one for each platform and interpreter that it is built for."""
+_NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
+_VERSION = re.compile(r"[A-Za-z0-9.!+_-]{1,200}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_COMMIT = re.compile(r"[0-9a-f]{40}")
+_URL = re.compile(r"(?:https?|file)://[^\s\"\\]{1,2000}")
+_DESCRIBE_S = 600.0
+
+
+@dataclass(frozen=True)
+class Wheel:
+    """One file of a package; where it was found is for the reader: the user's settings say where it
+    is taken from. Its size may not be known.
+    """
+
+    sha256: str
+    url: str = ""
+    size: int | None = None
+
+
+@dataclass(frozen=True)
+class PylockPackage:
+    """A package at one version, with the files that it may be installed from."""
+
+    name: str
+    version: str
+    wheels: tuple[Wheel, ...]
+    origin: WheelOrigin | None = None
+    """What it is built of, where it has no wheels."""
+
+    @property
+    def pin(self) -> str:
+        """As pip's ``--require-hashes`` reads it."""
+        known = [self.origin.wheel] if self.origin else [one.sha256 for one in self.wheels]
+        hashes = (f"    --hash=sha256:{one}" for one in known)
+        return " \\\n".join([f"{self.name}=={self.version}", *hashes]) + "\n"
+
+
+def pins(packages: Sequence[PylockPackage]) -> Lock:
+    """What is installed for them."""
+    lock = Lock("".join(package.pin for package in packages))
+    return replace(lock, options=torch_options(lock))
+
+
+def described(lock: Lock, python: str) -> tuple[PylockPackage, ...]:
+    """The pins with their files, as the index has them now, for the interpreter at this path.
+
+    Raises ``DependencyError`` where no file of a package is one that the pins permit.
+    """
+    versions = [line.partition(" ")[0] for line in lock.text.splitlines()]
+    found = listed(versions, python, lock.options)
+    permitted = set(re.findall(r"--hash=sha256:([0-9a-f]{64})", lock.text))
+    built = _origins(lock)
+    kept = []
+    for package in found:
+        origin = next((built[one.sha256] for one in package.wheels if one.sha256 in built), None)
+        if origin is not None:
+            kept.append(PylockPackage(package.name, package.version, (), origin))
+            continue
+        wheels = tuple(wheel for wheel in package.wheels if wheel.sha256 in permitted)
+        if not wheels:
+            raise DependencyError(
+                f"the index has {package.name}=={package.version}, but no file of it for {python} "
+                "with the hash that was chosen. Choose again: envhub lock --upgrade REF",
+                reason="integrity",
+            )
+        kept.append(PylockPackage(package.name, package.version, wheels))
+    return tuple(kept)
+
+
+def listed(
+    versions: Sequence[str], python: str, options: Sequence[str] = (), *, refresh: bool = False
+) -> tuple[PylockPackage, ...]:
+    """What the index has of each ``name==version``. Raises as ``uv.run``."""
+    text = uv.run(
+        [
+            *("pip", "compile", "-", *uv.NO_BUILDS, "--no-deps", "--format", "pylock.toml"),
+            *("--no-header", "--no-annotate", *Target(python=python).options),
+            *(*index.options(), *options),
+            *(("--refresh",) if refresh else ()),
+        ],
+        what="the files of the packages could not be listed",
+        given="".join(f"{one}\n" for one in versions if "==" in one),
+        timeout_s=_DESCRIBE_S,
+    )
+    where = "the answer of uv"
+    return read(document(text, where), where)
+
+
+def document(text: str, where: str) -> dict[str, Any]:
+    """The TOML of a lock file; ``LockError`` if it is none, or too long."""
+    try:
+        return toml.loads(text, MAX_CHARACTERS, generated=True)
+    except ValueError as error:
+        raise LockError(f"{where} is not valid TOML: {error}") from error
+
+
+def read(document: Mapping[str, Any], where: str) -> tuple[PylockPackage, ...]:
+    """The packages in a lock file, sorted by name. Raises ``LockError``."""
+    if document.get("lock-version") != "1.0":
+        raise LockError(f"{where} is not a lock file of version 1.0")
+    given = document.get("packages")
+    if not isinstance(given, list) or len(given) > MAX_PACKAGES:
+        raise LockError(f"packages in {where} is not a list of at most {MAX_PACKAGES}")
+    found = [_package(one, where) for one in given]
+    names = [package.name for package in found]
+    if len(set(names)) != len(names):
+        raise LockError(f"{where} names a package twice; a lock of envhub is for one interpreter")
+    return tuple(sorted(found, key=lambda package: package.name))
+
+
+def _package(given: object, where: str) -> PylockPackage:
+    if not isinstance(given, dict):
+        raise LockError(f"a package in {where} is not a table")
+    name, version = given.get("name"), given.get("version")
+    if not _is(name, _NAME):
+        raise LockError(f"{str(name)[:80]!r} in {where} is not a normalized name of a package")
+    try:
+        if not _is(version, _VERSION):
+            raise InvalidVersion("no text")
+        Version(version)
+    except InvalidVersion as error:
+        raise LockError(f"{name} in {where} has no version: {str(version)[:80]!r}") from error
+    if origin := _origin(given, name, version, where):
+        return PylockPackage(name, version, (), origin)
+    if others := sorted({"vcs", "directory", "archive", "marker"} & given.keys()):
+        raise LockError(
+            f"{name} in {where} has {', '.join(others)}; only wheels of an index are installed"
+        )
+    wheels = given.get("wheels")
+    if not isinstance(wheels, list) or not 1 <= len(wheels) <= MAX_WHEELS:
+        raise LockError(f"{name} in {where} has no list of 1 to {MAX_WHEELS} wheels")
+    return PylockPackage(
+        name, version, tuple(_wheel(wheel, f"{name} in {where}") for wheel in wheels)
+    )
+
+
+def _wheel(given: object, where: str) -> Wheel:
+    found = table(given, "hashes").get("sha256")
+    if not isinstance(given, dict) or not _is(found, _SHA256):
+        raise LockError(f"a wheel of {where} has no SHA-256")
+    url, size = given.get("url", ""), given.get("size")
+    if type(size) is not int or size < 0:
+        size = None
+    return Wheel(found, without_login(url) if isinstance(url, str) else "", size)
+
+
+def _is(value: object, form: re.Pattern[str]) -> TypeGuard[str]:
+    return isinstance(value, str) and form.fullmatch(value) is not None
+
+
+def _origin(given: Mapping[str, Any], name: str, version: str, where: str) -> WheelOrigin | None:
+    """What a package is built of; None for one that has wheels on an index."""
+    ours = table(given, "tool", "envhub")
+    if not ours:
+        return None
+    wheel, environment = ours.get("wheel"), ours.get("environment")
+    if not _is(wheel, _SHA256) or not _is(environment, _SHA256):
+        raise LockError(f"{name} in {where} has no hashes of the built files")
+    if vcs := table(given, "vcs"):
+        return WheelOrigin(_of_git(vcs, name, version, where), environment, wheel)
+    sdist = table(given, "sdist")
+    url, digest = sdist.get("url"), table(sdist, "hashes").get("sha256")
+    if not _is(url, _URL) or not _is(digest, _SHA256):
+        raise LockError(f"{name} in {where} has no source with a URL and a SHA-256")
+    return WheelOrigin(Source(name, version, url, digest), environment, wheel)
+
+
+def _of_git(vcs: Mapping[str, Any], name: str, version: str, where: str) -> Source:
+    below = f"#subdirectory={vcs['subdirectory']}" if vcs.get("subdirectory") else ""
+    try:
+        asked = Requirement(f"{name} @ git+{vcs.get('url')}@{vcs.get('commit-id')}{below}")
+        found = of_git(asked, where)
+    except InvalidRequirement:
+        found = None
+    if found is None or not _COMMIT.fullmatch(found.commit):
+        raise LockError(f"{name} in {where} has no full commit of a repository of git")
+    return replace(found, name=name, version=version, where="")
+
+
+def _origins(lock: Lock) -> dict[str, WheelOrigin]:
+    """What was built here of the packages of a lock, by the hash of the wheel."""
+    folders = [Path(option) for option in lock.options if option.startswith("/")]
+    wheels = [wheel for folder in folders for wheel in folder.glob("*.whl")]
+    found = [built for built in map(describe, wheels) if built is not None]
+    return {one.wheel: one for one in found}
+
+
+def written(packages: Sequence[PylockPackage]) -> str:
+    """The packages as the standard has them."""
+    lines = []
+    for package in packages:
+        lines += ["", "[[packages]]", *rows({"name": package.name, "version": package.version})]
+        if package.origin is not None:
+            lines += rows(_of_origin(package.origin))
+        else:
+            lines += ["wheels = [", *(f"    {as_toml(_row(one))}," for one in package.wheels), "]"]
+    return "\n".join([*lines, ""])
+
+
+def _row(wheel: Wheel) -> dict[str, object]:
+    size = {} if wheel.size is None else {"size": wheel.size}
+    return {"url": wheel.url, **size, "hashes": {"sha256": wheel.sha256}}
+
+
+def _of_origin(origin: WheelOrigin) -> dict[str, object]:
+    source = origin.source
+    ours = {"envhub": {"wheel": origin.wheel, "environment": origin.environment}}
+    if not source.commit:
+        sdist = {"url": source.url, "hashes": {"sha256": source.sha256}}
+        return {"sdist": sdist, "tool": ours}
+    below = {"subdirectory": source.subdirectory} if source.subdirectory else {}
+    vcs = {"type": "git", "url": source.url, "commit-id": source.commit, **below}
+    return {"vcs": vcs, "tool": ours}
+
+
+def rows(table: Mapping[str, object]) -> list[str]:
+    """The lines of a table of TOML."""
+    return [f"{name} = {as_toml(value)}" for name, value in table.items()]
+
+
+def as_toml(value: object) -> str:
+    """A value in one line. A text of JSON is one of TOML, but for one control character."""
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(rows(value))} }}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(as_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

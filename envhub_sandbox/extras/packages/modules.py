@@ -1,0 +1,338 @@
+"""The modules that a repository imports: what brings each, and what to do where one is missing.
+
+Which distribution brings one says its own pyproject.toml, or a table of ours,
+``hub/sources/modules.txt``; never an index: anybody may publish a package under a module's name.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import sys
+import sysconfig
+from collections.abc import Collection, Mapping, Sequence
+from functools import lru_cache
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.folders import cache_root, keep, recall
+from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.runtime import mapped_modules
+from envhub_worker.protocol.text import printable
+
+if TYPE_CHECKING:
+    from envhub_sandbox.extras.packages.declared import DeclaredPackages, WantedPackage
+
+_FORMAT = 2
+_READ: dict[tuple[Path, str], tuple[tuple[str, str, int], ...]] = {}
+_MOST = 64
+_MOST_NOTED = 4
+"""Modules noted for a commit: each costs another installation."""
+_SHOWN = 20
+_LONGEST = 100
+_MISSING = r"No module named '([\w.]+)'"
+_WORKERS = {"cloudpickle", "gymnasium", "msgpack", "numpy", "farama_notifications"}
+"""Modules that are in every jail."""
+_GYMNASIUM = (
+    (
+        r"(Ant|HalfCheetah|Hopper|Humanoid|HumanoidStandup|InvertedDoublePendulum"
+        r"|InvertedPendulum|Pusher|Reacher|Swimmer|Walker2d)-v[45]",
+        ("mujoco", "gymnasium[mujoco]", "mujoco"),
+    ),
+    (
+        r"(LunarLander|LunarLanderContinuous|BipedalWalker|BipedalWalkerHardcore|CarRacing)-v\d",
+        ("Box2D", "gymnasium[box2d]", "box2d box2d-py"),
+    ),
+    (r"ALE/.*", ("ale_py", "gymnasium[atari]", "ale-py")),
+    (
+        r"(CartPole|MountainCar|MountainCarContinuous|Pendulum|Acrobot)-v\d drawn",
+        ("pygame", "gymnasium[classic-control]", "pygame pygame-ce"),
+    ),
+    (
+        r"(Blackjack|CliffWalking|CliffWalkingSlippery|FrozenLake|FrozenLake8x8|Taxi)-v\d drawn",
+        ("pygame", "gymnasium[toy-text]", "pygame pygame-ce"),
+    ),
+)
+"""Extras of Gymnasium by patterns of the ids that need them; ``drawn`` follows an id that is made
+with a ``render_mode``."""
+
+
+@dataclass(frozen=True)
+class Guess:
+    """A module that is imported, with the requirement that brings it (and the place of the import),
+    and the canonical names of distributions, any of which does.
+    """
+
+    module: str
+    wanted: WantedPackage
+    brought_by: tuple[str, ...]
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """For the provenance."""
+        return {
+            "module": self.module,
+            "requirement": str(self.wanted.requirement),
+            "where": self.wanted.where,
+        }
+
+    def is_among(self, names: Collection[str]) -> bool:
+        """Whether one of these distributions, by canonical name, brings it."""
+        return not set(self.brought_by).isdisjoint(names)
+
+
+def guessed(snapshot: Snapshot) -> tuple[Guess, ...]:
+    """What a repository imports, as far as it is known what brings it.
+
+    What its declared packages bring is among it: that is known once versions are chosen.
+    """
+    return _guessed(snapshot.root, read(snapshot))
+
+
+@lru_cache(maxsize=64)
+def _guessed(root: Path, rows: tuple[tuple[str, str, int], ...]) -> tuple[Guess, ...]:
+    if not rows:
+        return ()
+    from envhub_sandbox.extras.packages.declared import optional, parse_requirement
+
+    extras = optional(root)
+    found: dict[str, Guess] = {}
+    for name, file, line in rows:
+        known = _of_id(name) if "-" in name else _of_module(name, extras)
+        if known is not None and len(found) < _MOST:
+            module, requirement, brought_by = known
+            wanted = parse_requirement(
+                requirement,
+                f"{printable(file, 200)}, line {line}, which needs {module}" if line else file,
+            )
+            found.setdefault(requirement, Guess(module, wanted, tuple(brought_by)))
+    return tuple(found.values())
+
+
+def _of_id(text: str) -> tuple[str, str, list[str]] | None:
+    for pattern, (module, requirement, names) in _GYMNASIUM:
+        if re.fullmatch(pattern, text):
+            return module, requirement, names.split()
+    return None
+
+
+def _of_module(name: str, extras: Mapping[str, WantedPackage]) -> tuple[str, str, list[str]] | None:
+    from packaging.utils import canonicalize_name
+
+    from envhub_sandbox.hub.sources.parsing import of_module
+
+    distributions = of_module(name)
+    names = list(map(str, map(canonicalize_name, distributions or [name.partition(".")[0]])))
+    own = next((str(extras[one].requirement) for one in names if one in extras), None)
+    if own is None and not distributions:
+        return None
+    return name.partition(".")[0], own or distributions[0], names
+
+
+def is_here(guess: Guess) -> bool:
+    """Whether a jail in this interpreter can import its module. Nothing is imported.
+
+    A jail does not have what only this process imports from: the folder of its program, the
+    current one, and those of PYTHONPATH.
+    """
+    program = getattr(sys.modules.get("__main__"), "__file__", None)
+    own = {"", os.getcwd()}
+    own.update(map(os.path.abspath, os.environ.get("PYTHONPATH", "").split(os.pathsep)))
+    if program and sys.path[0] == os.path.dirname(os.path.abspath(program)):
+        own.add(sys.path[0])
+    folders = [path for path in sys.path if path not in own]
+    return not _built_on_import(guess.module) and bool(_path_here(guess.module, folders))
+
+
+def _path_here(module: str, folders: Sequence[str]) -> str:
+    """Where this process finds a top-level module, as data: no finder is asked but Python's own,
+    since there are finders that install what they are asked for. Empty for nowhere.
+    """
+    mapped = mapped_modules(sys.meta_path).get(module)
+    spec = None if mapped else PathFinder.find_spec(module, folders)
+    if spec is None:
+        return mapped[0] if mapped else _built_on_import(module)
+    return spec.origin or next(iter(spec.submodule_search_locations or ()), "")
+
+
+def _built_on_import(module: str) -> str:
+    """The folder that Meson's finder builds a module in, each time it is imported."""
+    for finder in sys.meta_path:
+        if module in getattr(finder, "_top_level_modules", ()):
+            return str(getattr(finder, "_build_path", finder))
+    return ""
+
+
+def read(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
+    """Modules that a repository imports and does not have, and ids of environments; file and line.
+
+    A commit's are remembered: they are read in a process of their own. Not by the snapshot, which
+    lists its files: of many thousands, to be hashed and held.
+    """
+    place = snapshot.root, snapshot.path  # a root holds one commit
+    if place not in _READ:
+        if len(_READ) >= _MOST:
+            _READ.clear()
+        _READ[place] = _recalled(snapshot)
+    return _READ[place]
+
+
+def note_missing(snapshot: Snapshot, said: str) -> bool:
+    """Remember that a repository's packages import a module, by the text of an error; False where
+    that was known, or it is not known what brings it.
+
+    Trust: text from the worker. It chooses among the modules of our table, as an entry file can.
+    """
+    from envhub_sandbox.hub.sources.parsing import of_module
+
+    module = found[1][:_LONGEST] if (found := re.search(_MISSING, said)) else ""
+    known = read(snapshot)
+    names = _WORKERS.union(name.partition(".")[0] for name, _, _ in known)
+    noted = sum(line == 0 for _, _, line in known)
+    if not of_module(module) or module.partition(".")[0] in names or noted >= _MOST_NOTED:
+        return False
+    rows = *known, (module, f"a package of it, which imports {module}", 0)
+    _READ[snapshot.root, snapshot.path] = rows
+    keep(*_place(snapshot), json.dumps(rows))
+    return True
+
+
+def _place(snapshot: Snapshot) -> tuple[Path, str]:
+    """The folder and the name of what is remembered of a commit."""
+    facts = json.dumps([_FORMAT, sys.version_info[:2], snapshot.commit, snapshot.path])
+    return cache_root() / "imports", hashlib.sha256(facts.encode()).hexdigest()
+
+
+def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
+    place = _place(snapshot)
+    with contextlib.suppress(ValueError, TypeError):
+        rows = json.loads(recall(*place) or "")
+        return tuple((str(name), str(file), int(line)) for name, file, line in rows)
+    from envhub_sandbox.hub.sources import parsing
+
+    files = parsing.read(snapshot)
+    found = [(one.module, one.file, one.line) for one in parsing.imports(snapshot, files)]
+    found = [row for row in found if row[0].partition(".")[0] not in _WORKERS]
+    rows = [*found, *(row for row in parsing.ids(snapshot, files) if _of_id(row[0]))]
+    keep(*place, json.dumps(rows))
+    return tuple(rows)
+
+
+@dataclass(frozen=True)
+class MissingModule:
+    """Advice for a repository whose import fails: in which sandbox it ran, ``where`` its packages
+    were to come from (see ``Choice``), the interpreter that the caller named, and whether it ran in
+    an environment of its own.
+    """
+
+    snapshot: Snapshot
+    place: str
+    where: str
+    python: str | Path | None
+    own: bool
+
+    def advice(self, said: str = "") -> str:
+        """What the repository declares, where it imports the module that ``said`` names, and what
+        helps.
+        """
+        from envhub_sandbox.extras.packages.declared import declared
+
+        module = found[1] if (found := re.search(_MISSING, said)) else ""
+        try:
+            says = declared(self.snapshot.root, self.snapshot.path)
+        except DependencyError as error:
+            return f"What it declares cannot be taken: {error}"
+        return f"{_what(says, self.snapshot)}.{self._where(module)} {self._cure(module, says)}"
+
+    def _where(self, module: str) -> str:
+        for name, file, line in read(self.snapshot) if module else ():
+            if line and name.partition(".")[0] == module.partition(".")[0]:
+                return f" {printable(file, 200)}, line {line} imports {name}."
+        return ""
+
+    def _cure(self, module: str, says: DeclaredPackages | None) -> str:
+        from envhub_sandbox.hub.sources.parsing import of_module
+
+        names = of_module(module)
+        path = _path_here(module.partition(".")[0], sys.path) if module else ""
+        if path and not names:  # an index may have another one of that name
+            return self._local(module.partition(".")[0], path)
+        if "." in module and not names:
+            return f"A package of another version has {module}"
+        name = next(iter(names), "NAME-OF-THE-PACKAGE")
+        extra = option_name("dependencies", {"extra": [name]})
+        if self.place in ("docker", "remote"):
+            return self._elsewhere(extra)
+        if self.python is not None:
+            return f"It ran in {self.python}: install the package there, or leave out that argument"
+        if self.own:
+            return f"It ran in an environment of its own; the package joins it with {extra}"
+        here = f"It ran in this interpreter ({sys.executable})"
+        if self.where == "host" and says is not None and says.wanted:
+            host = option_name("dependencies", "host")
+            return f"{here}, as {host} says; leave that out to give it an environment of its own"
+        return f"{here}; it gets an environment of its own, and the package in it, with {extra}"
+
+    def _local(self, module: str, path: str) -> str:
+        """What grants a module that this process can import, and the jail cannot."""
+        here = f"{module} is importable here at {path}, which the jail cannot see"
+        if self.place == "docker":
+            image = option_name("sandbox", "docker:IMAGE")
+            return f"{here}: it ran in a container; name an image that has it, with {image}"
+        if self.place == "remote":
+            return f"{here}: it ran on another host, whose operator has to install it"
+        if self.own:
+            host = option_name("dependencies", "host")
+            return f"{here}: it ran in an environment of its own; {host} runs it in this one"
+        python = self.python or sys.executable
+        folders = Path(path).absolute().parents
+        project = next((one for one in folders if (one / "pyproject.toml").is_file()), None)
+        project = project or next((one for one in folders if (one / "setup.py").is_file()), None)
+        editable = "" if _built_on_import(module) else "-e "
+        if project is not None:
+            words = f"{python} -m pip install {editable}{project}"
+            return f"{here}. If you trust its code, which then runs here, too, install it: {words}"
+        folder = folders[Path(path).stem == "__init__"]
+        return (
+            f"{here}: it has the packages of {python} alone. Copy the module into the repository, "
+            f"or write the line {folder} into a file NAME.pth in {sysconfig.get_path('purelib')}"
+        )
+
+    def _elsewhere(self, extra: str) -> str:
+        where = "in a container" if self.place == "docker" else "on another host"
+        if self.own:
+            return f"It ran {where}, with packages of its own; this one joins them with {extra}"
+        if self.place == "docker":
+            image = option_name("sandbox", "docker:IMAGE")
+            return (
+                f"It ran {where}, with the image's packages: it gets others with {extra}, or "
+                f"with an image that has them (envhub image build REF, then {image})"
+            )
+        return (
+            f"It ran {where}, with the packages of its server: its operator installs the package "
+            "into the server's interpreter, or starts the server with --dependencies, and the "
+            f"package comes with {extra}"
+        )
+
+
+def _what(found: DeclaredPackages | None, snapshot: Snapshot) -> str:
+    if found is not None and found.wanted:
+        names = [str(wanted.requirement) for wanted in found.wanted]
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        return f"Its {found.source} declares {', '.join(names[:_SHOWN])}{more}"
+    from envhub_sandbox.extras.packages.declared import not_read
+
+    seen = not_read(snapshot.root, snapshot.path)
+    if seen:
+        return (
+            f"It has {', '.join(seen)}, which may declare it and is not read: only "
+            "requirements.txt, [project] of pyproject.toml and the metadata of a script are"
+        )
+    return "It declares no packages"

@@ -1,0 +1,254 @@
+"""From a repository's files to the packages that it runs with: the same steps for every place.
+
+read what it is to have (``request_of``), take the place's own packages if they meet it, choose
+versions (``resolution_for``), make an environment. What differs between this machine, a container
+and a server on another host is a ``PackageTarget``. With a lock file its packages are used and no
+others, and nothing that has drifted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+from envhub_sandbox.errors import (
+    DependencyError,
+    LockError,
+    PolicyError,
+    name_source,
+)
+from envhub_sandbox.extras.packages.request import Choice, PackageRequest, Tell, request_of
+from envhub_sandbox.hub.reference import PYPI
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system import log
+from envhub_sandbox.system.log import DEPENDENCIES
+from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.text import size_text
+
+if TYPE_CHECKING:
+    from envhub_sandbox.extras.packages.builds.wheels import WheelOrigin
+    from envhub_sandbox.extras.packages.environments import Environment
+    from envhub_sandbox.extras.packages.interpreters import Interpreter
+    from envhub_sandbox.extras.packages.locks.lockfile import LockFile
+    from envhub_sandbox.extras.packages.resolution.resolve import Lock
+    from envhub_worker.protocol.manifest.manifest import Manifest
+
+_CHECK_REFERENCE = (
+    "The reference names the package: is it spelt so, and has the index that version?"
+)
+
+
+@dataclass(frozen=True)
+class PackageSet:
+    """Packages that were made for a repository.
+
+    Attributes:
+        packages: Their folder, or their name in the place that has them.
+        facts: What is in it, as plain data.
+        python: The interpreter that they are for; empty where the place knows it.
+        environment: The folder's record, where it is on this machine.
+    """
+
+    packages: str
+    facts: dict[str, Any]
+    python: str = ""
+    environment: Environment | None = None
+
+    @classmethod
+    def of(cls, made: Environment) -> PackageSet:
+        """A folder of this machine."""
+        return cls(str(made.packages), made.facts, made.python, made)
+
+
+class PackageTarget(Protocol):
+    """A place that a repository's packages are for."""
+
+    def meets(self, request: PackageRequest) -> bool:
+        """Whether what is installed there is enough."""
+
+    def make(self, request: PackageRequest, tell: Tell) -> PackageSet | None:
+        """Packages of the repository's own; None where the place says that its own are enough."""
+
+
+@dataclass(frozen=True)
+class ThisMachine:
+    """The interpreters of this machine; with ``upgrade``, versions are chosen again."""
+
+    upgrade: bool = False
+
+    def meets(self, request: PackageRequest) -> bool:
+        """Whether this process's interpreter has all of it."""
+        from envhub_sandbox.extras.packages import interpreters, modules
+
+        met = interpreters.first_unmet(request) is None
+        return met and all(map(modules.is_here, request.guesses))
+
+    def make(self, request: PackageRequest, tell: Tell) -> PackageSet:
+        """An environment; raises as ``resolution_for`` and ``environments.provide``."""
+        from envhub_sandbox.extras.packages import environments
+        from envhub_sandbox.extras.packages.resolution import resolutions
+
+        found = resolutions.resolution_for(request, tell, upgrade=self.upgrade)
+        if found.lock.has_cuda and not request.gpu:
+            _warn_of_cuda(found.lock, found.interpreter)
+        made = PackageSet.of(environments.provide(found.lock, found.interpreter, tell))
+        inferred = [one.facts for one in request.guesses if one.module in found.taken]
+        return replace(made, facts=made.facts | {"inferred": inferred}) if inferred else made
+
+
+def _warn_of_cuda(lock: Lock, interpreter: Interpreter) -> None:
+    """Say what is to come, before it is downloaded, and what brings less."""
+    from envhub_sandbox.extras.packages import environments
+    from envhub_sandbox.extras.packages.locks import pylock
+
+    if environments.ready(environments.key_of(lock, interpreter)) is not None:
+        return
+    size = 0
+    with contextlib.suppress(DependencyError, LockError):  # the installation will say what is wrong
+        found = pylock.listed(lock.packages, interpreter.path, lock.options)
+        size = sum(max((wheel.size or 0 for wheel in one.wheels), default=0) for one in found)
+    much = f" ({size_text(size)} of downloads)" if size else ""
+    warnings.warn(
+        f"PyTorch comes with CUDA{much}, and jails have no GPU here: the index has no build "
+        "without. UV_TORCH_BACKEND=cpu in the environment takes PyTorch's own, by its index; "
+        f"{option_name('policy', {'gpu': True})} gives jails a GPU",
+        stacklevel=2,
+    )
+
+
+HERE = ThisMachine()
+
+
+def packages_for(
+    snapshot: Snapshot, choice: Choice, target: PackageTarget = HERE, *, gpu: bool = False
+) -> PackageSet | None:
+    """The packages that a repository runs with; None for those that the place has.
+
+    Progress is shown on a terminal. Raises ``DependencyError``, with what to change.
+    """
+    from envhub_sandbox.extras.packages.locks.day import settled
+
+    try:
+        request = request_of(snapshot, settled(snapshot, choice), gpu=gpu)
+        if request is None or (not request.always and target.meets(request)):
+            return None
+        with log.progress_shown("packages") as tell:
+            try:
+                return target.make(request, tell)
+            except DependencyError as error:
+                unavailable = error.reason in ("resolution", "index")
+                if request.wanted or request.always or not unavailable:
+                    raise
+                # what it imports was read, and not said: it may do without
+                DEPENDENCIES.warning("%s: nothing is installed for it: %s", snapshot.label, error)
+                return None
+    except DependencyError as error:
+        if snapshot.repo_type == PYPI and _is_unknown(snapshot.repo_id, error):
+            error.args = (f"{error}\n{_CHECK_REFERENCE}", *error.args[1:])
+        name_source(error, snapshot.label)
+        raise
+
+
+def _is_unknown(repo_id: str, error: DependencyError) -> bool:
+    """Whether the index does not have the package that a reference names, or not that version."""
+    name = re.escape(re.sub(r"[-_.]+", "-", re.split(r"[\[#@]", repo_id)[0]).lower())
+    said = rf"no version of {name}\b|\b{name} was not found"
+    return error.reason == "resolution" and re.search(said, str(error)) is not None
+
+
+def opened_lock(
+    path: str | os.PathLike[str], sandbox: object, python: object, dependencies: object
+) -> LockFile:
+    """The lock of these arguments of ``make_env``; ``PolicyError`` if others say something else."""
+    if python is not None or dependencies != "auto":
+        raise PolicyError(
+            f"{option_name('lock')} has the packages already; leave out {option_name('python')} "
+            f"and {option_name('dependencies')}"
+        )
+    if sandbox != "process":
+        raise PolicyError(
+            f"{option_name('lock')} is for {option_name('sandbox', 'process')}; an image is locked "
+            "by its digest, and on another host the operator of the server chooses its packages"
+        )
+    from envhub_sandbox.extras.packages.locks import lockfile
+
+    return lockfile.read(path)
+
+
+def locked_packages(snapshot: Snapshot, lock: LockFile) -> PackageSet:
+    """The environment of its packages; made if there is none.
+
+    Raises ``LockDriftError`` where the files or the interpreter are others.
+    """
+    from envhub_sandbox.extras.packages import environments, interpreters
+    from envhub_sandbox.extras.packages.locks import lockfile, making, pylock
+
+    here = making.with_files(lock, snapshot)
+    making.refuse(making.differences(lock, here), snapshot.label)
+    try:
+        interpreter = interpreters.find(lock.runner.python)
+        here = replace(here, runner=lockfile.Runner.of(interpreter))
+        making.refuse(making.differences(lock, here), snapshot.label)
+        with log.progress_shown("packages") as tell:
+            locked = [one.origin for one in lock.packages if one.origin is not None]
+            pins = _with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)
+            made = environments.provide(pins, interpreter, tell)
+            return PackageSet.of(made)
+    except (DependencyError, LockError) as error:
+        name_source(error, snapshot.label)
+        raise
+
+
+def _with_wheels(
+    lock: Lock,
+    locked: Sequence[WheelOrigin],
+    interpreter: Interpreter,
+    tell: Tell,
+) -> Lock:
+    """The lock with wheels of what has none: kept, or built again of the locked sources.
+    Raises ``DependencyError`` where one cannot be built, or its source is another.
+    """
+    from envhub_sandbox.extras.packages import environments
+    from envhub_sandbox.extras.packages.builds.wheels import describe
+    from envhub_sandbox.extras.packages.resolution.resolutions import build
+    from envhub_sandbox.extras.packages.resolution.resolve import Lock
+
+    if not locked or environments.ready(environments.key_of(lock, interpreter)) is not None:
+        return lock
+    wheels = build([one.source for one in locked], interpreter, tell)
+    text, options = lock.text, list(lock.options)
+    for origin, wheel in zip(locked, wheels, strict=True):
+        built = describe(wheel)
+        assert built is not None
+        if built.wheel != origin.wheel:
+            tell(f"{origin.source.name} was built again, and not to the same bytes")
+        text = text.replace(f"sha256:{origin.wheel}", f"sha256:{built.wheel}")
+        options += ["--find-links", str(wheel.parent)]
+    return Lock(text, tuple(options))
+
+
+def check_locked_tasks(
+    manifest: Manifest, lock: LockFile, label: str, env_kwargs: Mapping[str, Any]
+) -> None:
+    """Raise ``LockDriftError`` where a manifest's environments are not the locked ones.
+
+    With other arguments a repository may well make other environments.
+    """
+    from envhub_sandbox.extras.packages.locks import lockfile, making
+
+    if lock.spaces is None or lockfile.arguments_text(env_kwargs) != lock.spaces.arguments:
+        return
+    now = [
+        making.fingerprint_of_task(
+            *(env.suite, env.task, env.autoreset_mode),
+            *(env.single_observation_space, env.single_action_space),
+        )
+        for env in manifest.envs
+    ]
+    making.refuse(list(making.drift_of_tasks(lock.spaces.tasks, now)), label)

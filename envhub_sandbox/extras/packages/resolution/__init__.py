@@ -1,0 +1,1 @@
+"""From requirements to wheels: the index, uv, what was resolved."""

@@ -1,0 +1,271 @@
+"""Which versions a repository gets, and of which interpreter: chosen once, and remembered.
+
+What is remembered goes by everything that the choice depends on: the same repository gets the same
+packages on this machine until newer ones are asked for, and needs no index a second time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from packaging.utils import parse_wheel_filename
+
+from envhub_sandbox.errors import DependencyError, EnvHubError
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.declared import Source, of_git, parse_requirement
+from envhub_sandbox.extras.packages.interpreters import Interpreter
+from envhub_sandbox.extras.packages.request import PackageRequest, Tell, chosen
+from envhub_sandbox.extras.packages.resolution import index, resolve
+from envhub_sandbox.extras.packages.resolution.resolve import WORKERS, Lock, Target
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system import folders
+
+if TYPE_CHECKING:
+    from envhub_sandbox.extras.packages.modules import Guess
+
+_FORMAT = 2
+_MOST_CURES = 6
+Builder = Callable[[Sequence[Source], Interpreter, Tell], Sequence[Path]]
+"""Makes one wheel of each source, in the same order; each lies in a folder of wheels alone, and
+stays there. Raises ``DependencyError``."""
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """Versions and the interpreter that they are for; and the modules that are imported and not
+    declared, and were installed for it.
+    """
+
+    lock: Lock
+    interpreter: Interpreter
+    taken: tuple[str, ...] = ()
+
+
+def build(sources: Sequence[Source], interpreter: Interpreter, tell: Tell) -> list[Path]:
+    """A wheel of each source, in the same order: kept from before, or built in a jail."""
+    from envhub_sandbox.extras.packages.builds.build import build_wheels
+
+    return build_wheels(sources, interpreter, tell, partial(_lock_for, builder=BUILDER))
+
+
+BUILDER: Builder | None = build
+"""Makes wheels of packages that have none."""
+
+
+def resolution_for(
+    request: PackageRequest, tell: Tell = lambda line: None, *, upgrade: bool = False
+) -> Resolution:
+    """Versions for an interpreter of this machine: remembered, or chosen.
+
+    Raises ``DependencyError``, with what to change: there are no versions, no interpreter, no
+    index or no uv.
+    """
+    first = interpreters.find(request.python, request.supports, fetch=request.fetch_python)
+    key = key_of(request, first)
+    known = None if upgrade else recall(key)
+    if known is not None:
+        return known
+    tell(f"choosing versions for {request.source}")
+    found = _chosen(request, first, upgrade, tell)
+    strict = option_name("dependencies", "declared")
+    for one in request.guesses:
+        if one.module in found.taken:
+            text = (
+                f"{one.wanted.requirement} is installed, which nothing declares "
+                f"({one.wanted.where}); {strict} takes what is declared alone"
+            )
+            warnings.warn(text, stacklevel=2)
+    remember(key, found)
+    return found
+
+
+def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Tell) -> Resolution:
+    """By the first interpreter that has versions, of wheels alone if that can be."""
+    tried: list[str] = []
+    failed: list[DependencyError] = []
+    for asked, builder in _attempts(request):
+        failed.clear()
+        for one in _candidates(first, request):
+            tried.append(one.version)
+            lock = partial(_lock_for, interpreter=one, tell=tell, builder=builder, refresh=refresh)
+            try:
+                found, taken = versions_for(asked, lock)
+                return Resolution(found, one, tuple(guess.module for guess in taken))
+            except DependencyError as error:
+                if error.reason != "resolution":
+                    raise
+                failed.append(error)
+                if not resolve.is_about_python(error):
+                    break
+    cure = _cure(request, failed[0], first)
+    what = resolve.advice(request.python, list(dict.fromkeys(tried)), failed[0], cure)
+    raise DependencyError(f"{failed[0]}\n{what}", reason="resolution") from failed[0]
+
+
+def _cure(
+    request: PackageRequest, error: DependencyError, interpreter: Interpreter
+) -> dict[str, list[str]] | None:
+    """Keys of ``dependencies`` with which a resolution succeeds; None if none is known."""
+    for keys in islice(resolve.cures(error), _MOST_CURES):
+        with contextlib.suppress(EnvHubError):
+            changed = chosen(keys, None)[0]
+            asked = replace(
+                request,
+                guesses=(),
+                without=(*request.without, *changed.without),
+                override=(*request.override, *changed.override),
+            )
+            resolve.resolve(asked, Target(python=interpreter.path))
+            return keys
+    return None
+
+
+def _attempts(request: PackageRequest) -> Iterator[tuple[PackageRequest, Builder | None]]:
+    """What to ask for, and how: last of all without what is only guessed."""
+    every = (*request.wanted, *(guess.wanted for guess in request.guesses))
+    wheels_alone = BUILDER is None or not any(one.requirement.url for one in every)
+    ways = [*([None] if wheels_alone else []), *([BUILDER] if BUILDER else [])]
+    less = [replace(request, guesses=())] if request.guesses and request.wanted else []
+    return ((asked, builder) for asked in (request, *less) for builder in ways)
+
+
+def _candidates(first: Interpreter, request: PackageRequest) -> Iterator[Interpreter]:
+    yield first
+    if not request.python:
+        yield from interpreters.others(request.supports, first)
+
+
+def _lock_for(
+    request: PackageRequest,
+    interpreter: Interpreter,
+    tell: Tell,
+    *,
+    builder: Builder | None,
+    refresh: bool = False,
+) -> Lock:
+    """Versions; each round builds what has no wheel and then looks at what that needs."""
+    target = Target(python=interpreter.path)
+    links: list[str] = []
+    if builder is not None:
+        request, links = _built_from_git(request, builder, interpreter, tell)
+    built: set[str] = set()
+    while True:
+        try:
+            lock = resolve.resolve(request, target, options=links, refresh=refresh, tell=tell)
+            break
+        except DependencyError as error:
+            names = sorted(set(resolve.without_wheels(error)) - built)
+            if error.reason != "resolution" or builder is None or not names:
+                raise
+            # what one needs is known once it is built: then others may be chosen
+            sources = resolve.sources_of(request, target, names, links)
+            if built.issuperset(one.name for one in sources):
+                raise
+        built.update(one.name for one in sources)
+        links += _links(builder(sources, interpreter, tell))
+    return resolve.without_cuda(
+        request,
+        lock,
+        lambda asked, more: resolve.resolve(asked, target, options=[*links, *more], tell=tell),
+    )
+
+
+def _links(wheels: Sequence[Path]) -> list[str]:
+    folders = dict.fromkeys(str(wheel.parent) for wheel in wheels)
+    return [word for folder in folders for word in ("--find-links", folder)]
+
+
+def _built_from_git(
+    request: PackageRequest, builder: Builder, interpreter: Interpreter, tell: Tell
+) -> tuple[PackageRequest, list[str]]:
+    """The request with versions of wheels instead of repositories, and where these wheels are."""
+    wanted, wheels = [], []
+    for one in request.wanted:
+        source = of_git(one.requirement, one.where) if one.requirement.url else None
+        if source is None:
+            wanted.append(one)
+            continue
+        [wheel] = builder([source], interpreter, tell)
+        wheels.append(wheel)
+        extras = ",".join(sorted(one.requirement.extras))
+        text = f"{source.name}[{extras}]=={parse_wheel_filename(wheel.name)[1]}"
+        wanted.append(parse_requirement(text, one.where))
+    return replace(request, wanted=tuple(wanted)), _links(wheels)
+
+
+def versions_for(
+    request: PackageRequest, resolved: Callable[[PackageRequest], Lock]
+) -> tuple[Lock, tuple[Guess, ...]]:
+    """Versions, and what was taken that nothing else brings; ``resolved`` gives them without
+    guesses.
+    """
+    taken = request.guesses
+    if request.wanted or not taken:
+        lock = resolved(request)
+        names = {pin.partition("==")[0] for pin in lock.packages}
+        taken = tuple(one for one in request.guesses if not one.is_among(names))
+        if not taken:
+            return lock, ()
+    wanted = (*request.wanted, *(one.wanted for one in taken))
+    return resolved(replace(request, wanted=wanted, guesses=())), taken
+
+
+def root() -> Path:
+    """Where they lie; ours alone, since what lies there is installed."""
+    return folders.cache_root() / "resolutions"
+
+
+def key_of(request: PackageRequest, interpreter: Interpreter) -> str:
+    """The name of a resolution: the hash of what it depends on, the places of packages included."""
+    asked = [
+        sorted(map(str, rows)) for rows in (request.wanted, request.constraints, request.override)
+    ]
+    asked.append(sorted(str(one.wanted.requirement) for one in request.guesses))
+    rest = [request.without, request.exclude_newer, request.python, request.supports, request.gpu]
+    facts = [_FORMAT, WORKERS, asked, asdict(interpreter), rest, index.places()]
+    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+
+def recall(key: str) -> Resolution | None:
+    """What was chosen, if that is known, and its interpreter is still the same."""
+    try:
+        facts = json.loads(folders.recall(root(), key) or "{}")
+        lock = Lock(str(facts["lock"]), tuple(map(str, facts["options"])))
+        interpreter = Interpreter(**facts["interpreter"])
+        # what the worker needs is in each: an empty one was lost
+        known = _stamp(interpreter) == facts["stamp"] and all(
+            os.sep not in option or os.path.isdir(option) for option in lock.options
+        )
+        if lock.packages and known:
+            return Resolution(lock, interpreter, tuple(map(str, facts["taken"])))
+    except (OSError, ValueError, LookupError, TypeError):
+        pass
+    return None
+
+
+def remember(key: str, found: Resolution) -> None:
+    """Keep a choice. A cache that cannot be written is no error."""
+    facts = {
+        "lock": found.lock.text,
+        "options": found.lock.options,
+        "interpreter": asdict(found.interpreter),
+        "stamp": _stamp(found.interpreter),
+        "taken": found.taken,
+    }
+    folders.keep(root(), key, json.dumps(facts))
+
+
+def _stamp(interpreter: Interpreter) -> list[int]:
+    """Size and time of the interpreter's file, to notice an upgrade in place."""
+    status = os.stat(interpreter.path)
+    return [status.st_size, status.st_mtime_ns]

@@ -1,0 +1,398 @@
+"""Requirements to pins: every package with the hashes of its wheels, for one interpreter."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+from envhub_sandbox.errors import (
+    DependencyError,
+)
+from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.declared import Source, WantedPackage, parse_requirement
+from envhub_sandbox.extras.packages.request import PackageRequest, Tell
+from envhub_sandbox.extras.packages.resolution import index, uv
+from envhub_sandbox.hub.sources import toml
+from envhub_sandbox.settings.options import option_name
+
+WORKERS = ("cloudpickle>=3", "gymnasium>=0.26", "msgpack>=1.0.5", "numpy>=1.21")
+"""What the worker's jails import besides: the repository's versions must be among these.
+Gymnasium and numpy may be older in a jail than outside."""
+_WORKERS_SINCE = {
+    "cloudpickle": "2023-11-01",
+    "gymnasium": "2022-11-01",
+    "gymnasium-notices": "2022-11-01",
+    "msgpack": "2023-11-01",
+    "numpy": "2022-10-01",
+}
+"""From when on there are such versions, with wheels for Python 3.11: no earlier date counts."""
+_RESOLVE_S = 600.0
+MOST_SOURCES = 50
+"""Packages that are built for one request: a repository names them, and each costs a resolution."""
+_TORCH = ("torch", "torchvision", "torchaudio")
+_CPU_INDEX = ("--torch-backend", "cpu")
+_PIN = re.compile(r"([a-z0-9][a-z0-9.-]*)==([A-Za-z0-9.!+_-]+) \\")
+_IS_PYTHON = re.compile(
+    r"does not satisfy Python|with a matching Python|no usable wheels|requires? Python"
+)
+_NOT_FOUND = "not found in the package registry"
+REQUIRED = "What is required of these packages:"
+_BOUNDED = re.compile(
+    r"(?<![\w.-])(?!python\b)([A-Za-z][A-Za-z0-9._-]*)(?:\[[\w,-]+\])?[<>=!~]=?\d", re.I
+)
+_NO_WHEELS = re.compile(r"Wheels are required for `([A-Za-z0-9._-]+)`")
+_NEEDS_PYTHON = re.compile(r"does not satisfy Python>=(3\.\d+)")
+_HASH = re.compile(r"    --hash=(sha(?:256|384|512):[0-9a-f]+)( \\)?")
+
+
+@dataclass(frozen=True)
+class Lock:
+    """Every package, pinned, with the hashes of its wheels, as pip's ``--require-hashes`` reads it;
+    and options for uv where the index does not have all of them.
+    """
+
+    text: str
+    options: tuple[str, ...] = ()
+
+    @property
+    def has_cuda(self) -> bool:
+        """Whether PyTorch is among them, with packages of NVIDIA's."""
+        pins = self.packages
+        return any(pin.startswith("torch==") for pin in pins) and any(
+            pin.startswith(("nvidia-", "cuda-")) for pin in pins
+        )
+
+    @property
+    def digest(self) -> str:
+        """Hexadecimal SHA-256 of the text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    @property
+    def packages(self) -> list[str]:
+        """``name==version`` of each."""
+        lines = [line.split()[0] for line in self.text.splitlines() if line[:1].isalnum()]
+        return [line for line in lines if "==" in line]
+
+
+@dataclass(frozen=True)
+class Target:
+    """What packages are for: an interpreter that is here, or one that is described.
+
+    Attributes:
+        python: Its path; empty where it is not on this machine.
+        version: Where it is not: its version, ``"3.12"``.
+        machine: Likewise, as ``os.uname`` says it; it has Linux with glibc.
+    """
+
+    python: str = ""
+    version: str = ""
+    machine: str = ""
+
+    def __str__(self) -> str:
+        return self.python or f"Python {self.version} on {self.machine}"
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """For uv."""
+        if self.python:
+            return ("--python", self.python)
+        platform = f"{self.machine}-manylinux_2_28"
+        # uv asks some interpreter all the same, and a .venv beside or above its working directory,
+        # which is one for temporary files, is the first that it would run: named, it runs ours
+        ours = ("--python", interpreters.own().path)
+        return (*ours, "--python-version", self.version, "--python-platform", platform)
+
+
+def resolve(
+    request: PackageRequest,
+    target: Target,
+    *,
+    options: Sequence[str] = (),
+    refresh: bool = False,
+    tell: Tell = lambda line: None,
+) -> Lock:
+    """Pins for a target; wheels only, nothing is built.
+
+    What the worker needs comes on top; guesses are not looked at. The installation needs the
+    ``options``, too. With ``refresh`` the index is asked anew for what uv has seen a moment ago.
+    Raises ``DependencyError``, also for a version that is there, but not with a hash that was
+    asked for (``reason`` is then ``"integrity"``).
+    """
+    words = [*uv.NO_BUILDS, "--generate-hashes", *options, *(["--refresh"] if refresh else [])]
+    text = _compiled(request, target, words, tell)
+    return Lock(_with_their_hashes(_pins(text), request.wanted), tuple(options))
+
+
+def _compiled(
+    request: PackageRequest,
+    target: Target,
+    words: Sequence[str],
+    tell: Tell,
+    settings: Mapping[str, str] = {},
+) -> str:
+    """What ``uv pip compile`` prints; raises as ``resolve``."""
+    ours = WORKERS if request.runs_worker else ()
+    where = "the worker of envhub-sandbox"
+    every = [*request.wanted, *(parse_requirement(text, where) for text in ours)]
+    files = {
+        "--constraints": _lines(request.constraints),
+        "--overrides": _lines(request.override),
+        "--excludes": "".join(f"{name}\n" for name in request.without),
+    }
+    named = {option: f"{option[2:]}.txt" for option, text in files.items() if text}
+    ask = partial(
+        uv.run,
+        [
+            *("pip", "compile", "-", "--no-header", "--no-annotate"),
+            *(*target.options, *index.options(), *words),
+            *_exclude_newer(request),
+            *(word for pair in named.items() for word in pair),
+        ],
+        what=f"no versions of the packages could be chosen for {target}",
+        given=_lines(every),
+        timeout_s=_RESOLVE_S,
+        files={**{name: files[option] for option, name in named.items()}, **settings},
+    )
+    try:
+        return ask(tell=tell)
+    except DependencyError as error:
+        if error.reason != "resolution":
+            raise
+        if _NOT_FOUND in str(error) and index.hides_refusals():
+            _raise_refusal(ask)
+        what = _what_is_required(str(error), [*every, *request.constraints, *request.override])
+        raise DependencyError(f"{error}\n{what}", reason="resolution") from error
+
+
+def _exclude_newer(request: PackageRequest) -> Iterator[str]:
+    """The date of a request, for uv, and later ones for what the worker cannot have older."""
+    if not request.exclude_newer:
+        return
+    yield f"--exclude-newer={request.exclude_newer}"
+    for name, day in _WORKERS_SINCE.items():
+        if request.runs_worker and request.exclude_newer < day:
+            yield f"--exclude-newer-package={name}={day}"
+
+
+def _raise_refusal(ask: Callable[..., str]) -> None:
+    """Raise why an index did not answer: this strategy says so, and the others do not."""
+    try:
+        ask(variables={"UV_INDEX_STRATEGY": "first-index"})
+    except DependencyError as error:
+        if error.reason != "resolution":
+            raise
+
+
+def sources_of(
+    request: PackageRequest, target: Target, names: Sequence[str], links: Sequence[str]
+) -> list[Source]:
+    """The source distributions that are chosen for packages without wheels. Nothing is built.
+
+    What each needs is not known yet: it counts once there is a wheel of it.
+    """
+    words = ["--config-file", "uv.toml", "--format", "pylock.toml", *links]
+    known = sorted(names)
+    while True:
+        try:
+            text = _compiled(request, target, words, lambda line: None, _may_be_built(known))
+            break
+        except DependencyError as error:  # it names one at a time
+            further = set(without_wheels(error)).difference(known)
+            if error.reason != "resolution" or not further or len(known) >= MOST_SOURCES:
+                raise
+            known = sorted(further.union(known))
+    rows = toml.loads(text, len(text), generated=True).get("packages", [])
+    return [
+        Source(row["name"], row["version"], sdist["url"], sdist["hashes"]["sha256"])
+        for row in rows
+        if (sdist := row.get("sdist")) and not row.get("wheels")
+    ]
+
+
+def uploaded(wanted: WantedPackage, python: str) -> str:
+    """The day of the release that is chosen, as the index says it; empty if it does not."""
+    words = [*uv.NO_BUILDS, "--no-deps", "--format", "pylock.toml"]
+    request = PackageRequest("", (wanted,), runs_worker=False)
+    text = _compiled(request, Target(python=python), words, lambda line: None)
+    days = re.findall(r"upload-time = [^\d]{0,40}(\d{4}-\d{2}-\d{2})", text)
+    return max(days, default="")
+
+
+def _may_be_built(names: Iterable[str]) -> dict[str, str]:
+    """uv's settings with which these are chosen as sources."""
+    tables = "".join(
+        f'[[dependency-metadata]]\nname = "{name}"\nrequires-dist = []\n' for name in names
+    )
+    quoted = ", ".join(f'"{name}"' for name in names)
+    return {"uv.toml": f"no-build = true\nno-binary-package = [{quoted}]\n{tables}"}
+
+
+def _lines(wanted: Iterable[WantedPackage]) -> str:
+    wanted = list(wanted)
+    for one in wanted:
+        if one.requirement.url is not None:
+            raise DependencyError(
+                f"{one.where} takes {one.requirement.name} from {one.requirement.url[:200]!r}, "
+                "which is not built here; only packages of the index are installed",
+                reason="requirement",
+            )
+    return "".join(f"{one.requirement}\n" for one in wanted)
+
+
+def is_about_python(error: DependencyError) -> bool:
+    """Whether another Python may help, as far as uv's text says."""
+    return _IS_PYTHON.search(str(error)) is not None
+
+
+def without_wheels(error: DependencyError) -> list[str]:
+    """Packages without a wheel, as far as uv's text says; none if it asks for another Python."""
+    return [] if _NEEDS_PYTHON.search(str(error)) else _NO_WHEELS.findall(str(error))
+
+
+def _pins(text: str) -> list[tuple[str, str, list[str]]]:
+    """Name, version and hashes of each package; anything else in there is refused."""
+    found: list[tuple[str, str, list[str]]] = []
+    for line in text.splitlines():
+        if pin := _PIN.fullmatch(line):
+            found.append((pin[1], pin[2], []))
+        elif (hashed := _HASH.fullmatch(line)) and found:
+            found[-1][2].append(hashed[1])
+        else:
+            raise DependencyError(
+                f"uv returned {line[:200]!r}, which is not a pinned package with hashes: the index "
+                "must list the hashes of its packages",
+                reason="resolution",
+            )
+    return found
+
+
+def _with_their_hashes(
+    pins: Iterable[tuple[str, str, list[str]]], wanted: Sequence[WantedPackage]
+) -> str:
+    """The lock's text, with only those hashes of a package that its requirement permits."""
+    permitted: dict[str, tuple[set[str], str]] = {}
+    for asked in wanted:
+        if asked.hashes:
+            key = canonicalize_name(asked.requirement.name)
+            permitted.setdefault(key, (set(), asked.where))[0].update(asked.hashes)
+    lines = []
+    for name, version, hashes in pins:
+        among, where = permitted.get(canonicalize_name(name), (set(hashes), ""))
+        kept = [known for known in hashes if known in among]
+        if not kept:
+            raise DependencyError(
+                f"the index has {name}=={version}, but no file of it with a hash that {where} "
+                "names. It was replaced there, or the hash is another file's",
+                reason="integrity",
+            )
+        lines.append(" \\\n".join([f"{name}=={version}", *(f"    --hash={k}" for k in kept)]))
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _what_is_required(said: str, every: Sequence[WantedPackage]) -> str:
+    """The requirements that an explanation speaks of, with where each stands."""
+    words = {canonicalize_name(word) for word in re.findall(r"[A-Za-z0-9][A-Za-z0-9._-]*", said)}
+    named = [one for one in every if canonicalize_name(one.requirement.name) in words]
+    lines = [
+        f"  {one.requirement}  ({one.where}{_from_a_folder(one.requirement.name)})"
+        for one in (named or every)[:20]
+    ]
+    return "\n".join([REQUIRED, *lines])
+
+
+def _from_a_folder(name: str) -> str:
+    """That this interpreter has a package from a folder, which an index need not know."""
+    folder = interpreters.installed_from(name)
+    host = option_name("dependencies", "host")
+    return f"; installed here from {folder}, which {host} uses" if folder else ""
+
+
+def cures(error: DependencyError) -> Iterator[dict[str, list[str]]]:
+    """Keys of ``dependencies`` that may help against what uv says, by the packages it speaks of."""
+    said = str(error).partition(REQUIRED)[0]
+    unknown = re.findall(rf"([A-Za-z0-9][A-Za-z0-9._-]*) was {_NOT_FOUND}", said)
+    unbuilt = re.match(r"([A-Za-z0-9][\w.-]*) \S+(?: \(.{0,300}?\))? has no wheel for", said)
+    if unbuilt is not None:
+        yield {"override": [unbuilt[1]]}  # another version may have one
+        unknown.append(unbuilt[1])
+    yield from ({"without": [name]} for name in unknown)
+    words = Counter(name.lower() for name in _BOUNDED.findall(said))
+    ours = {line.partition(">")[0]: line for line in WORKERS}
+    for name, _ in words.most_common():
+        yield {"override": [ours.get(name, name)]}
+
+
+def advice(
+    asked: str, tried: Sequence[str], error: DependencyError, cure: Mapping[str, list[str]] | None
+) -> str:
+    """What to do where nothing satisfies all requirements, by the Python that was asked for, the
+    versions that were tried, the error of the first of them, and keys of ``dependencies`` that are
+    known to help.
+    """
+    others = ""
+    needed = _NEEDS_PYTHON.findall(str(error))
+    if needed and (asked or len(tried) > 1):
+        python = {"python": max(needed, key=Version), "fetch_python": True}
+        others = f" have uv fetch another Python, {option_name('dependencies', python)};"
+    elif needed:
+        others = f" name another Python, {option_name('dependencies', {'python': max(needed)})};"
+    also = f"Python {', '.join(tried)} of this machine were tried. " if len(tried) > 1 else ""
+    change = option_name("dependencies", cure or {"override": ["NAME<2"], "without": ["NAME"]})
+    known = ", for which there are versions" if cure else ""
+    return (
+        f"{also}Change one of them in the repository, or for this run with {change}{known};{others}"
+        f" or use an interpreter that has the packages, with {option_name('python', 'PATH')}"
+    )
+
+
+def without_cuda(
+    request: PackageRequest,
+    lock: Lock,
+    resolved: Callable[[PackageRequest, Sequence[str]], Lock],
+) -> Lock:
+    """The same without CUDA, where jails have no GPU and the index has such builds of PyTorch.
+
+    Which builds there are, only the index knows, and many mirrors have none of these: that is no
+    error, and the versions that were chosen first stay. ``resolved`` takes further options for uv.
+    """
+    if request.gpu or not lock.has_cuda or os.environ.get("UV_TORCH_BACKEND"):
+        return lock
+    for asked, options in _ways_without_cuda(request, lock):
+        try:
+            found = resolved(asked, options)
+        except DependencyError:
+            continue
+        if not found.has_cuda:
+            return found
+    return lock
+
+
+def _ways_without_cuda(
+    request: PackageRequest, lock: Lock
+) -> Iterator[tuple[PackageRequest, Sequence[str]]]:
+    """The same versions of the user's own index; and of PyTorch's, where he has chosen none."""
+    rows = (pin.partition("==") for pin in lock.packages)
+    held = tuple(
+        parse_requirement(f"{name}=={version.partition('+')[0]}+cpu", "the choice of no CUDA")
+        for name, _, version in rows
+        if name in _TORCH
+    )
+    yield replace(request, constraints=(*request.constraints, *held)), ()
+    if not index.is_chosen():
+        yield request, _CPU_INDEX
+
+
+def torch_options(lock: Lock) -> tuple[str, ...]:
+    """What uv needs to find these versions again, where only they are known."""
+    without = any(
+        pin.partition("==")[0] in _TORCH and pin.endswith("+cpu") for pin in lock.packages
+    )
+    return _CPU_INDEX if without and not index.is_chosen() else ()

@@ -1,0 +1,294 @@
+"""uv: found, started in an empty folder, and its refusals as errors of ours.
+
+It builds nothing, reads no settings but ours (``index.py``), and downloads no interpreter. What it
+prints is the user's to read, but quotes a stranger's names: it is escaped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import IO
+
+from envhub_sandbox.errors import DependencyError, DependencyReason
+from envhub_sandbox.extras.packages.request import Tell
+from envhub_sandbox.extras.packages.resolution import index
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system import locks
+from envhub_sandbox.system.folders import remove_tree
+from envhub_sandbox.system.platform import IS_WINDOWS
+from envhub_worker.protocol.text import printable
+
+if sys.platform == "linux":
+    import resource
+
+NO_BUILDS = ("--no-config", "--no-build")
+OLDEST = (0, 11, 16)
+"""Before, a wheel's scripts went wherever the wheel said, and what is editable was built in spite
+of ``--no-build``. pyproject.toml asks for the same; but there may be another on PATH."""
+_VERSION_S = 60.0
+_SECRET = re.compile(r"(?<=://)[^/?#\s]*(?=@)|(?<=\?)[^\s?=]+=[^\s'\"`)]+")
+"""What may be one in a URL; uv hides passwords, but for those in a query or in what is no URL."""
+_WATCH_S = 1.0
+_CLEAN_S = 60.0
+CACHE_WAIT_S = 10.0
+"""For how long to wait for others who use uv's cache."""
+LISTEN_S = 10.0
+"""How long to read stderr after uv has ended: another process may hold it open for ever."""
+_SHOWN = 4000
+_KEPT_LINES = 400
+
+_NO_INDEX = (
+    "The package index did not answer. Check the network, or name a mirror in UV_INDEX_URL or in "
+    "pip's settings; environments that exist already work offline"
+)
+
+_NO_LOGIN = (
+    "An index or a proxy refused to answer without the right login. Write it into the index's URL "
+    "in UV_INDEX, UV_DEFAULT_INDEX or pip's settings (https://USER:PASSWORD@HOST/simple, with "
+    "other characters than letters and digits as %XX), into .netrc or a keyring; a proxy's into "
+    "HTTPS_PROXY"
+)
+
+# What uv says, and what that means for the user; the first that is found counts.
+_MEANINGS: tuple[tuple[str, DependencyReason, str], ...] = (
+    (
+        r"No space left|os error 28|Disk quota|os error 122",
+        "other",
+        "The disk is full; 'envhub cache remove --unused-for 30' removes what was not used for "
+        "30 days, 'uv cache prune' cleans uv's cache",
+    ),
+    (
+        r"Hash mismatch|hash mismatch",
+        "integrity",
+        "A package has another hash than the one that is known: it was replaced on the index or "
+        "during the download. It was not kept. If the index is right, resolve again: envhub "
+        "inspect --download --upgrade REF",
+    ),
+    (r"network was disabled", "index", _NO_INDEX),
+    (r"\b(401 Unauthorized|403 Forbidden|407 Proxy)", "index", _NO_LOGIN),
+    (
+        r"yanked",
+        "resolution",
+        "A release was yanked by its authors. Use another version, or name this one exactly: "
+        "'name==version'",
+    ),
+    (r"No solution found|unsatisfiable", "resolution", ""),
+    (
+        r"Failed to fetch|error sending request|Request failed|Connection|dns error|timed out"
+        r"|certificate|Failed to download|HTTP status",
+        "index",
+        _NO_INDEX,
+    ),
+)
+
+
+def run(
+    arguments: Sequence[str],
+    *,
+    what: str,
+    given: str = "",
+    timeout_s: float,
+    tell: Tell = lambda line: None,
+    keep: Iterable[int] = (),
+    watch: Callable[[], None] = lambda: None,
+    file_bytes: int | None = None,
+    files: Mapping[str, str] = {},
+    variables: Mapping[str, str] = {},
+) -> str:
+    """Run uv to its end, and return what it printed.
+
+    Args:
+        keep: Descriptors that it keeps open for as long as it lives.
+        watch: Called now and then; what it raises ends it.
+        file_bytes: The largest file that it may write.
+        files: Texts that it finds in its folder, by name.
+        variables: Of its environment, instead of ours.
+
+    Raises ``DependencyError``: it failed, or there is none.
+    """
+    lines, done = list[str](), threading.Event()
+    with (
+        tempfile.TemporaryDirectory(prefix="envhub-uv-") as nowhere,
+        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as asked,
+        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as printed,
+    ):
+        # uv reads projects and settings of the folder that it runs in
+        for name, text in files.items():
+            Path(nowhere, name).write_text(text, "utf-8")
+        asked.write(given)
+        asked.seek(0)
+        process = subprocess.Popen(
+            [command(), *arguments],
+            stdin=asked,
+            stdout=printed,
+            stderr=subprocess.PIPE,
+            cwd=nowhere,
+            env={**index.environment(), **variables},
+            pass_fds=() if IS_WINDOWS else tuple(keep),
+            text=True,
+            errors="replace",
+        )
+        heard = (process.stderr, lines, tell, done)
+        # not in a group of its own, which would outlive a server that is killed with its group
+        listener = threading.Thread(target=_listen, args=heard, daemon=True)
+        with process:
+            try:
+                listener.start()
+                if file_bytes is not None:
+                    _limit_files(process, file_bytes)
+                _wait(process, timeout_s, watch)
+            except subprocess.TimeoutExpired:
+                text = f"{what}: uv was not done after {timeout_s:.0f} s"
+                raise DependencyError(text, reason="index") from None
+            finally:
+                process.kill()
+                listener.join(LISTEN_S)
+                done.set()
+                if listener.is_alive():
+                    process.stderr = None  # closing it would wait for the listener
+        if sys.platform != "win32" and process.returncode == -signal.SIGXFSZ:
+            raise DependencyError(
+                f"{what}: a file was about to have more than {file_bytes} bytes", reason="size"
+            )
+        if process.returncode != 0:
+            raise _error(what, "\n".join(lines))
+        printed.seek(0)
+        return printed.read()
+
+
+def _limit_files(process: subprocess.Popen[str], largest: int) -> None:
+    if process.poll() is None and sys.platform == "linux":  # elsewhere ``watch`` measures alone
+        hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)[1]
+        limit = largest if hard == resource.RLIM_INFINITY else min(largest, hard)
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (limit, limit))
+        # no core of it either: the signal would leave one
+        resource.prlimit(process.pid, resource.RLIMIT_CORE, (0, 0))
+
+
+def _wait(process: subprocess.Popen[str], timeout_s: float, watch: Callable[[], None]) -> None:
+    until = time.monotonic() + timeout_s
+    while True:
+        try:
+            process.wait(min(_WATCH_S, max(until - time.monotonic(), 0)))
+            return
+        except subprocess.TimeoutExpired:
+            if time.monotonic() >= until:
+                raise
+            watch()
+
+
+def _listen(stream: IO[str], lines: list[str], tell: Tell, done: threading.Event) -> None:
+    """Pass on what is written on stderr until ``done``, and keep the last lines of it."""
+    for line in stream:
+        if done.is_set():
+            return
+        del lines[:-_KEPT_LINES]
+        lines.append(printable(_SECRET.sub("****", line.rstrip()), 500))
+        tell(lines[-1].strip())
+
+
+def command() -> str:
+    """uv's path; ``DependencyError`` if it is not installed, or too old."""
+    found: str | None
+    try:
+        from uv import find_uv_bin  # it knows where pip has put it, which need not be on PATH
+
+        found = str(find_uv_bin())
+    except (ImportError, FileNotFoundError):
+        found = shutil.which("uv")
+    if found is None:
+        raise DependencyError(
+            "uv, which resolves and installs packages, is neither installed in this interpreter "
+            "nor on PATH. Run: pip install uv. Or use this interpreter's packages, with "
+            f"{option_name('dependencies', 'host')}"
+        )
+    _check_release(found)
+    return found
+
+
+@lru_cache(maxsize=8)
+def _check_release(path: str) -> None:
+    try:
+        said = subprocess.run(
+            [path, "--version"], capture_output=True, timeout=_VERSION_S, check=True, text=True
+        ).stdout
+    except (OSError, ValueError, subprocess.SubprocessError) as error:
+        raise DependencyError(f"{path} does not say its version: {error}") from error
+    version = re.match(r"uv (\d+)\.(\d+)\.(\d+)", said)
+    if version is None or tuple(map(int, version.groups())) < OLDEST:
+        oldest = ".".join(map(str, OLDEST))
+        raise DependencyError(
+            f"{path} is {printable(said.strip(), 80)!r}: uv before {oldest} lets a package write "
+            f"outside its folder. Run: pip install 'uv>={oldest}'"
+        )
+
+
+def _error(what: str, said: str) -> DependencyError:
+    text = _in_the_users_words(said)[-_SHOWN:]
+    for pattern, reason, meaning in _MEANINGS:
+        if re.search(pattern, said):
+            host = option_name("dependencies", "host")
+            offline = f", and {host} takes the packages of this interpreter as they are"
+            cure = f" {meaning}{offline * (meaning == _NO_INDEX)}." if meaning else ""
+            return DependencyError(f"{what}.{cure}\n{text}", reason=reason)
+    return DependencyError(f"{what}; uv says:\n{text}")
+
+
+def _in_the_users_words(said: str) -> str:
+    """uv speaks to the author of the requirements; the reader here is another person."""
+    plain = re.sub(r"\byour requirements are unsatisfiable", "nothing satisfies all of them", said)
+    plain = re.sub(r"\b[Yy]ou require\b", "it is required that there be", plain)
+    return re.sub(r"^hint: ", "  ", plain, flags=re.MULTILINE).strip()
+
+
+@contextlib.contextmanager
+def cleared_after_refusal(pins: Sequence[str]) -> Iterator[None]:
+    """Remove what uv has of these packages if they are refused; they can be downloaded again.
+
+    uv unpacks a download in its cache before it installs it, and keeps what it had unpacked when
+    it was ended: a wheel that is too large would stay, and be found there the next time.
+    """
+    begun = time.time()
+    try:
+        yield
+    except DependencyError as error:
+        if error.reason == "index":
+            raise  # what has come is worth keeping
+        # from the file system's clock, which may be some milliseconds behind
+        if _remove_unfinished(index.uv_cache(), begun - 1):
+            names = sorted({pin.partition("==")[0] for pin in pins})
+            with contextlib.suppress(DependencyError):
+                run(
+                    ["cache", "clean", "--no-config", *names],
+                    what="uv's cache could not be cleaned",
+                    timeout_s=_CLEAN_S,
+                )
+        raise
+
+
+def _remove_unfinished(cache: Path, since: float) -> bool:
+    """Remove uv's temporary folders of this time, once no uv is at work that could own one.
+
+    Each holds this lock, shared, for as long as it works; where one works on, nothing is removed,
+    and False returned.
+    """
+    with (
+        contextlib.suppress(OSError),
+        locks.held(cache / ".lock", wait_s=CACHE_WAIT_S),
+    ):
+        for path in cache.glob(".tmp*"):
+            if path.lstat().st_mtime >= since:
+                remove_tree(path)
+        return True
+    return False

@@ -1,0 +1,95 @@
+"""The packages of a repository as ``make_env`` asks for them: see ``factory.package_source``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.extras.packages.modules import MissingModule, note_missing
+from envhub_sandbox.extras.packages.packages import (
+    PackageSet,
+    PackageTarget,
+    check_locked_tasks,
+    locked_packages,
+    opened_lock,
+    packages_for,
+)
+from envhub_sandbox.extras.packages.request import Choice, chosen
+from envhub_sandbox.hub.snapshot import Snapshot
+
+if TYPE_CHECKING:
+    from envhub_sandbox.extras.packages.locks.lockfile import LockFile
+    from envhub_worker.protocol.manifest.manifest import Manifest
+
+
+@dataclass(frozen=True)
+class RepositoryPackages:
+    """Makes what a repository declares and imports, or what a lock has."""
+
+    choice: Choice
+    python: str | Path | None
+    lock: LockFile | None
+
+    @classmethod
+    def of(
+        cls,
+        lock: str | os.PathLike[str] | None,
+        sandbox: object,
+        python: str | Path | None,
+        dependencies: str | os.PathLike[str] | Mapping[str, Any],
+    ) -> RepositoryPackages:
+        """Of arguments of ``make_env``. Raises ``PolicyError``, ``LockError``."""
+        opened = None if lock is None else opened_lock(lock, sandbox, python, dependencies)
+        return cls(*chosen(dependencies, python), opened)
+
+    @property
+    def assets(self) -> Sequence[str]:
+        """The further repositories that the lock names."""
+        return self.lock.assets if self.lock is not None else ()
+
+    @property
+    def always(self) -> bool:
+        """Whether the repository gets packages of its own, whatever the place has."""
+        return self.choice.where == "own"
+
+    def packages(
+        self, snapshot: Snapshot, target: PackageTarget | None, *, gpu: bool
+    ) -> PackageSet | None:
+        """Packages of its own, made for a place; None for those of the place."""
+        if self.lock is not None:
+            return locked_packages(snapshot, self.lock)
+        return None if target is None else packages_for(snapshot, self.choice, target, gpu=gpu)
+
+    def advice(self, snapshot: Snapshot, place: str, *, own: bool, said: str) -> str:
+        """What to do where a module is missing, for the error's text."""
+        return MissingModule(snapshot, place, self.choice.where, self.python, own).advice(said)
+
+    def note(self, snapshot: Snapshot, target: PackageTarget | None, said: str) -> bool:
+        """Note a module that was missing; whether ``packages`` gives others now."""
+        return self.choice.infer and self._chooses(target) and note_missing(snapshot, said)
+
+    def _chooses(self, target: PackageTarget | None) -> bool:
+        """Whether the versions of its packages are ours to choose."""
+        return self.lock is None and target is not None and self.choice.where != "host"
+
+    def of_its_day(
+        self, snapshot: Snapshot, target: PackageTarget | None, error: EnvHubError
+    ) -> str:
+        """What to do about an error that older packages may cure; empty for others."""
+        of_today = self._chooses(target) and self.choice.exclude_newer is None
+        if not of_today:
+            return ""
+        from envhub_sandbox.extras.packages.locks import day
+
+        return day.of_its_day(snapshot, error)
+
+    def check(
+        self, manifest: Manifest, label: str, env_kwargs: Mapping[str, Any], config: object
+    ) -> None:
+        """Raise ``LockDriftError`` where a manifest is not what was locked."""
+        if self.lock is not None and config is None:
+            check_locked_tasks(manifest, self.lock, label, env_kwargs)

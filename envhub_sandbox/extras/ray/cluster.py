@@ -1,0 +1,241 @@
+"""Ray itself, as far as this package uses it: the connection, an actor, its answers and its end.
+
+Trust: a node is its operator's, and what an actor answers is plain data that is checked here. Ray's
+own texts are shown, and nothing else of them is used.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import contextlib
+import importlib.util
+import json
+import platform
+import threading
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from envhub_sandbox.errors import (
+    PolicyError,
+    SandboxUnavailableError,
+    ServerBusyError,
+    WorkerStartupError,
+)
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.transport.remote_warnings import level_of_the_caller
+from envhub_worker.protocol.text import printable
+
+_MOST_BYTES = 65_536
+_SHOWN_CHARS = 2_000
+_GUESSES = "Some common causes include"
+"""From here on an error of Ray's is about any death, and not about this one."""
+_connecting = threading.RLock()  # interruption.md, rule 12
+
+
+def check_installed() -> None:
+    """Raises ``SandboxUnavailableError``: this interpreter has no Ray."""
+    if importlib.util.find_spec("ray") is None:
+        raise SandboxUnavailableError(
+            f"{option_name('sandbox', 'ray')} needs Ray, which this interpreter does not have: "
+            "pip install 'envhub-sandbox[ray]'"
+        )
+
+
+def name(address: str) -> str:
+    """What a cluster is called, of this Python; connects to nothing."""
+    import ray
+
+    if ray.is_initialized():
+        address = str(ray.get_runtime_context().gcs_address)
+    return f"Ray at {address or 'auto'}, Python {platform.python_version()}"
+
+
+def connect(address: str = "") -> None:
+    """Use the Ray that this process is connected to, or connect it.
+    ``address``: as ``ray.init`` takes it; without one a cluster that runs already, and else a local
+    one is started, with a warning that says so.
+    Raises ``PolicyError``: the process is connected to another cluster;
+    ``SandboxUnavailableError``: Ray does not come up, or no cluster is there.
+    """
+    check_installed()
+    import ray
+
+    with _connecting:
+        if ray.is_initialized():
+            _check_address(address, str(ray.get_runtime_context().gcs_address))
+            return
+        try:
+            is_local = _started_here(address)
+        except (ConnectionError, OSError, RuntimeError, ValueError) as error:
+            text = printable(str(error), _SHOWN_CHARS)
+            where = f" at {address!r}" if address else ""
+            raise SandboxUnavailableError(f"Ray cannot be used{where}: {text}") from error
+        if is_local:
+            cpus = ray.cluster_resources().get("CPU", 0)
+            started = f"ray.init was not called: a local Ray with {cpus:g} CPUs was started"
+            warnings.warn(started, RuntimeWarning, stacklevel=level_of_the_caller())
+
+
+def _started_here(address: str) -> bool:
+    import ray
+
+    try:
+        ray.init(address=address or "auto")
+    except ConnectionError:
+        if address:
+            raise
+        ray.init(address="local", include_dashboard=False)
+        return True
+    return False
+
+
+def _check_address(address: str, there: str) -> None:
+    if address not in ("", "auto", "local", there) and "://" not in address:
+        raise PolicyError(
+            f"RaySandbox(address={address!r}): this process is connected to the cluster at "
+            f"{there}. Leave the address out, or call ray.shutdown() first"
+        )
+
+
+def job() -> str | None:
+    """This process's connection to Ray, which each ``ray.init`` makes anew; None without one."""
+    import ray
+
+    return str(ray.get_runtime_context().get_job_id()) if ray.is_initialized() else None
+
+
+class PlacedActor:
+    """An actor with a worker server, of this process.
+    ``options``: how Ray places it, as ``ActorClass.options`` takes them.
+    """
+
+    def __init__(self, options: Mapping[str, Any]) -> None:
+        import ray
+
+        # late: it runs on the nodes, on Linux, and a client need not
+        from envhub_sandbox.extras.ray.actor import WorkerActor
+
+        self._job = job()
+        # not restarted: it would be another server, with other keys, which we start ourselves
+        remote = ray.remote(max_restarts=0, max_task_retries=0)(WorkerActor)
+        try:
+            self._handle = remote.options(**options).remote()
+        except (TypeError, ValueError) as error:
+            raise PolicyError(f"RaySandbox: {error}") from error
+        self._end: concurrent.futures.Future[Any] = concurrent.futures.Future()
+        self._called: Any = None
+        self._ended: Callable[[], object] = lambda: None
+
+    def start(self, client_key: str, within_s: float) -> dict[str, Any]:
+        """Have it started, once Ray has placed it.
+        Raises ``ServerBusyError``: Ray finds no place in time; ``SandboxUnavailableError``: a node
+        cannot make the ``runtime_env``; ``WorkerStartupError``: the actor or the server has ended.
+        """
+        import ray
+
+        try:
+            answer = ray.get(self._handle.start.remote(client_key), timeout=within_s)
+        except ray.exceptions.GetTimeoutError:
+            raise _busy(within_s) from None
+        except ray.exceptions.RuntimeEnvSetupError as error:
+            text = printable(str(error), _SHOWN_CHARS)
+            raise SandboxUnavailableError(f"Ray cannot make the runtime_env: {text}") from error
+        except ray.exceptions.RayError as error:
+            raise _not_started(error) from error
+        said = read_answer(answer)
+        if "error" in said:
+            text = printable(str(said["error"]), _SHOWN_CHARS)
+            raise WorkerStartupError(f"a worker server on a node of Ray: {text}")
+        return said
+
+    def watch(self, ended: Callable[[], object]) -> None:
+        """Have ``ended`` called, in any thread, once the server or the actor has ended."""
+        self._ended = ended
+        self._ask()
+
+    def _ask(self) -> None:
+        self._called = self._handle.wait.remote()
+        self._called.future().add_done_callback(self._answered)
+
+    def _answered(self, answer: concurrent.futures.Future[Any]) -> None:
+        import ray
+
+        if isinstance(answer.exception(), ray.exceptions.ActorUnavailableError):
+            with contextlib.suppress(Exception):  # Ray has been shut down
+                self._ask()  # it may live: Ray says when it knows
+                return
+        self._end.set_result(answer)
+        self._ended()
+
+    @property
+    def runs(self) -> bool:
+        """Whether it has not ended, as far as Ray has said."""
+        return not self._end.done() and job() == self._job
+
+    def end_text(self, wait_s: float) -> str:
+        """How it ended, in Ray's words or the server's; waits so long for them."""
+        if job() != self._job:
+            return "ray.shutdown() was called in this process, which ends its actors"
+        try:
+            answer = self._end.result(wait_s)
+        except (concurrent.futures.TimeoutError, TimeoutError):
+            return "Ray has not said that it ended"
+        error = answer.exception()
+        if error is not None:
+            return f"Ray says: {_one_line(str(error).partition(_GUESSES)[0])}"
+        try:
+            said = read_answer(answer.result())
+        except WorkerStartupError as error:  # whoever asks has an error of their own
+            return str(error)
+        code, log = _one_line(str(said.get("code"))), _one_line(str(said.get("log")))
+        return f"it ended with {code}: {log}"
+
+    def kill(self) -> None:
+        """End it, and with it its server. Idempotent; nothing after ``ray.shutdown``."""
+        import ray
+
+        if job() == self._job:
+            ray.kill(self._handle, no_restart=True)
+
+
+def read_answer(answer: object) -> dict[str, Any]:
+    """An actor's answer. Trust: input from a node. Raises ``WorkerStartupError``: it is none."""
+    try:
+        if type(answer) is bytes and len(answer) <= _MOST_BYTES:
+            said = json.loads(answer)
+            if type(said) is dict:
+                return said
+    except (ValueError, RecursionError):
+        pass
+    raise WorkerStartupError("an actor on a node of Ray gave an answer that is none of ours")
+
+
+def _one_line(text: str) -> str:
+    return printable(" ".join(text.split()), _SHOWN_CHARS)
+
+
+def _busy(within_s: float) -> ServerBusyError:
+    import ray
+
+    free = {one: round(count, 2) for one, count in ray.available_resources().items()}
+    shown = {one: free[one] for one in sorted(free) if not one.startswith(("node:", "object_"))}
+    return ServerBusyError(
+        f"Ray has started no worker server within {within_s:g} s, and {shown} are free in the "
+        f"whole cluster. Close environments, ask for less in RaySandbox(num_cpus=..., "
+        f"resources=...) or by a smaller {option_name('num_workers')}, add nodes, or wait for "
+        "longer with placement_s",
+        quota="cluster",
+    )
+
+
+def _not_started(error: Exception) -> WorkerStartupError:
+    words = _one_line(str(error))
+    WORKER.debug("no actor: %s", words)
+    if "envhub_sandbox" in words and "ModuleNotFoundError" in words:
+        return WorkerStartupError(
+            "a node of Ray has no envhub-sandbox. Install this release in the nodes' image, or "
+            f"pass RaySandbox(runtime_env={{'pip': ['envhub-sandbox[ray]']}}). Ray says: {words}"
+        )
+    return WorkerStartupError(f"Ray could not start a worker server: {words}")

@@ -1,0 +1,1 @@
+"""Worker servers on other hosts: their keys, connections and repositories."""

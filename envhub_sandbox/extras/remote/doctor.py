@@ -1,0 +1,87 @@
+"""``envhub doctor tcp://HOST:PORT``: what a server says, if it lets us in."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from envhub_sandbox.cli.shared.console import BAD, out, print_json, safe_line, show, show_rows
+from envhub_sandbox.cli.shared.exits import Exit
+from envhub_sandbox.extras.remote.sandbox import RemoteSandbox, ServerFacts, ask_facts
+from envhub_worker.protocol.text import size_text
+
+_USED = {
+    "sessions": "sessions",
+    "jails": "jails",
+    "runners": "runners",
+    "memory_bytes": "memory_limit_bytes",
+    "upload_bytes": "upload_bytes",
+    "inflight_bytes": "inflight_bytes",
+}
+"""Quotas, and what is used of them, by their names in the figures."""
+
+
+def examine_server(server: RemoteSandbox, profile: str, *, json: bool) -> Exit:
+    """Ask a server and print what it says; the exit code is that of the profile.
+    Raises ``EnvHubError``: it is not reached, or does not let us in.
+    """
+    facts = ask_facts(server)
+    code, problem = _verdict(facts, profile)
+    if json:
+        server_facts = {**asdict(facts), "endpoint": server.endpoint}
+        print_json({"server": server_facts, "profile": profile, "problem": problem, "code": code})
+    else:
+        print_facts(server, facts, problem)
+    return code
+
+
+def _verdict(facts: ServerFacts, profile: str) -> tuple[Exit, str | None]:
+    if facts.draining:
+        return Exit.WORKER, "it drains: it accepts nothing new"
+    if not facts.detailed or facts.enforces(profile):
+        return Exit.OK, None
+    return Exit.SANDBOX, (
+        f"no jail with the profile {profile!r} there: {facts.profile!r} is the strongest that it "
+        f"can have, and {facts.weakest_profile!r} the weakest that its operator permits"
+    )
+
+
+def print_facts(server: RemoteSandbox, facts: ServerFacts, problem: str | None) -> None:
+    """Print what a server says, and what keeps it from having a jail. Trust: the server's word."""
+    release = f"envhub-worker {facts.version}, protocol {facts.protocol}"
+    out(f"{safe_line(server.endpoint)}: {release}", "bold")
+    let_in = "asks for no key" if server.insecure_loopback else "knows our key"
+    show("answered", f"after {facts.answered_s:.2f} s; it {let_in}")
+    if facts.detailed:
+        granted = {"network": facts.network, "gpu": facts.gpu, "dependencies": facts.dependencies}
+        show("python", facts.python)
+        show("profiles", f"{facts.profile} at most; policies may ask for {facts.weakest_profile}")
+        show("permits", ", ".join(name for name, given in granted.items() if given) or "no more")
+    else:
+        out("It is older than this client, and does not say what it can enforce.")
+    if facts.quotas:
+        out()
+        show_rows([("quota", "used", "limit"), *_quotas(facts)], right=(1, 2))
+    if problem is not None:
+        out()
+        out(problem, BAD)
+
+
+def _quotas(facts: ServerFacts) -> list[tuple[str, str, str]]:
+    used: dict[str, Any] = facts.used
+    return [
+        (
+            _name(name),
+            _amount(name, used.get(_USED[name], 0)) if name in _USED else "",
+            _amount(name, limit),
+        )
+        for name, limit in facts.quotas.items()
+    ]
+
+
+def _name(quota: str) -> str:
+    return safe_line(quota.removesuffix("_bytes").replace("_", " "))
+
+
+def _amount(quota: str, amount: Any) -> str:
+    return size_text(amount) if quota.endswith("_bytes") else f"{amount:,}"

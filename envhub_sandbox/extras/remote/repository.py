@@ -1,0 +1,320 @@
+"""One repository on another host: what its server is sent, and what it says.
+
+A snapshot's files go there by hash, and only missing ones. Whether packages are installed there the
+server's operator decides. What is declared is read here, and again there; what is made lies there,
+and no file of it comes here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import stat
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+from envhub_sandbox.errors import (
+    DependencyError,
+    PolicyError,
+    RemoteProtocolError,
+    SnapshotError,
+    WorkerError,
+)
+from envhub_sandbox.extras.packages.packages import PackageSet
+from envhub_sandbox.extras.packages.request import PackageRequest
+from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
+from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.transport.connection import WorkerConnection
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.replies import expect_reply
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.text import printable
+
+if TYPE_CHECKING:
+    from envhub_sandbox.extras.packages.declared import WantedPackage
+
+PIECE_BYTES = 256 * 1024
+"""Small enough that a heartbeat does not wait long behind it."""
+_WINDOW = 8
+"""Pieces under way: together with the size, what fills a line of some 40 MB/s over 50 ms."""
+
+
+class Sent(NamedTuple):
+    """One file of a listing."""
+
+    path: str
+    size: int
+    sha256: bytes
+    executable: bool
+
+    @property
+    def row(self) -> tuple[object, ...]:
+        """As the server takes it."""
+        return tuple(self) if self.executable else tuple(self)[:-1]
+
+
+def listing(root: Path) -> tuple[Sent, ...]:
+    """Every file below a snapshot's root, hashed. Raises ``SnapshotError``."""
+    try:
+        return tuple(_sent(root, path) for path in sorted(_files(root)))
+    except OSError as error:
+        raise SnapshotError(f"the snapshot in {root} cannot be read: {error}") from error
+
+
+def _files(root: Path) -> Iterator[Path]:
+    for folder, _, names in os.walk(root):
+        yield from (Path(folder, name) for name in names)
+
+
+def _sent(root: Path, path: Path) -> Sent:
+    running, size = hashlib.sha256(), 0
+    with path.open("rb") as file:
+        while piece := file.read(PIECE_BYTES):
+            running.update(piece)
+            size += len(piece)
+        executable = bool(os.fstat(file.fileno()).st_mode & stat.S_IXUSR)
+    return Sent(path.relative_to(root).as_posix(), size, running.digest(), executable)
+
+
+def upload(
+    client: WorkerConnection, root: Path, files: tuple[Sent, ...], deadline: Deadline
+) -> tuple[str, int]:
+    """Bring files to a server; what it calls the snapshot, and how many bytes had to travel.
+    Raises ``SnapshotIntegrityError``: a file arrived as another than it left; ``WorkerError``: the
+    server does not take them, or took too long.
+    """
+    wanted = _offer(client, files, deadline)
+    by_hash = {file.sha256: file for file in files}
+    asked = {sha for sha in wanted.hashes if isinstance(sha, bytes)}  # each once, however often
+    missing = [file for sha, file in by_hash.items() if sha in asked]
+    if not wanted.hashes:
+        return wanted.snapshot, 0
+    _put(client, root, missing, deadline)
+    wanted = _offer(client, files, deadline)
+    if wanted.hashes:
+        raise WorkerError("the server has taken the snapshot's files and still wants some")
+    return wanted.snapshot, sum(file.size for file in missing)
+
+
+def _offer(client: WorkerConnection, files: tuple[Sent, ...], deadline: Deadline) -> m.MissingBlobs:
+    offer = m.OfferSnapshot(tuple(file.row for file in files))
+    reply, _ = client.request(offer, deadline=deadline)
+    return expect_reply(reply, m.MissingBlobs)
+
+
+def _put(client: WorkerConnection, root: Path, missing: list[Sent], deadline: Deadline) -> None:
+    """Send piece after piece, with some under way; the server answers in order."""
+    under_way: deque[int] = deque()
+    for sha256, offset, piece in _pieces(root, missing):
+        if len(under_way) >= _WINDOW:
+            expect_reply(client.receive(under_way.popleft(), deadline)[0], m.Done)
+        under_way.append(client.send(m.PutBlob(sha256, offset), [piece]))
+    while under_way:
+        expect_reply(client.receive(under_way.popleft(), deadline)[0], m.Done)
+
+
+def _pieces(root: Path, missing: list[Sent]) -> Iterator[tuple[bytes, int, bytes]]:
+    for sent in missing:
+        with (root / sent.path).open("rb") as file:
+            offset = 0
+            while True:
+                piece = file.read(PIECE_BYTES)
+                if piece or not sent.size:
+                    yield sent.sha256, offset, piece
+                offset += len(piece)
+                if offset >= sent.size or not piece:
+                    break
+
+
+_HELLO_S = 30.0
+_MAKE_S = 2 * 3600.0
+_POLL_S = 0.5
+_NAME_CHARS = 64
+_FACTS = ("lock", "packages")
+_MAX_PINS = 10_000
+_MAX_CHARS = 300
+
+
+@dataclass(frozen=True)
+class ServerPackages:
+    """Packages that a server makes itself: a ``PackageTarget``.
+
+    Attributes:
+        use: Gives the server.
+        orders: What each was made of, by the server's name for it; what is made is added.
+    """
+
+    use: Callable[[], ServerUse[WorkerServer]]
+    orders: dict[str, m.NeedPackages]
+
+    def meets(self, request: PackageRequest) -> bool:
+        """Unknown here: the server looks at its own packages when it is asked for some."""
+        return False
+
+    def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet | None:
+        """The packages that the server makes; None where its own are enough.
+        Raises ``DependencyError``: they cannot be made; the text says what to change;
+        ``PolicyError``: the server's operator does not permit it; ``ServerBusyError``: others of
+        the same key are at it.
+        """
+        order = order_of(request)
+        use = self.use()
+        server = use.server
+        try:
+            client = WorkerConnection(server.endpoint, server.process_fd, far=server.far)
+            with contextlib.closing(client):
+                client.hello(Deadline(_HELLO_S))
+                made = request_packages(order, client, Deadline(_MAKE_S), tell)
+        finally:
+            use.release()
+        if made is not None:
+            self.orders[made.packages] = order
+        return made
+
+
+def order_of(request: PackageRequest) -> m.NeedPackages:
+    """What a server is asked for. Raises ``PolicyError`` for a path of this machine."""
+    if os.sep in request.python:
+        raise PolicyError(
+            f"python in dependencies is {request.python!r}, an interpreter of this machine, and a "
+            "remote server has its own: name a version, such as '3.12'"
+        )
+    if request.fetch_python:
+        raise PolicyError(
+            "fetch_python in dependencies is for this machine; a server's operator installs its "
+            "interpreters"
+        )
+    return m.NeedPackages(
+        _rows(request.wanted),
+        request.supports,
+        request.python,
+        request.exclude_newer or "",
+        request.always,
+        guesses=tuple(
+            (str(one.wanted), one.wanted.where, one.module, " ".join(one.brought_by))
+            for one in request.guesses
+        ),
+        constraints=_rows(request.constraints),
+        override=_rows(request.override),
+        without=request.without,
+        gpu=request.gpu,
+    )
+
+
+def _rows(wanted: Sequence[WantedPackage]) -> tuple[tuple[str, str], ...]:
+    return tuple((str(one), one.where) for one in wanted)
+
+
+def request_packages(
+    order: m.NeedPackages,
+    client: WorkerConnection,
+    deadline: Deadline,
+    tell: Callable[[str], None] = lambda line: None,
+) -> PackageSet | None:
+    """Have packages made; None where the server's own do.
+    Raises ``DependencyError``: they cannot be made; the text says what to change; ``PolicyError``:
+    the server's operator does not permit it; ``ServerBusyError``: others of the same key are at it;
+    ``WorkerTimeoutError``: it took too long.
+    """
+    shown = ""
+    while True:
+        reply, _ = client.request(order, deadline=deadline)
+        found = expect_reply(reply, m.Packages)
+        if found.state == "own":
+            return None
+        if found.state == "made":
+            return PackageSet(_name(found.name), _facts(found.facts, order))
+        if found.state != "making":
+            raise RemoteProtocolError("the server has packages in a state that there is not")
+        line = printable(found.progress[:_MAX_CHARS], _MAX_CHARS)
+        if line != shown:
+            tell(line)
+            shown = line
+        left = deadline.left_s()
+        time.sleep(_POLL_S if left is None else min(_POLL_S, left))
+
+
+def _name(name: str) -> str:
+    """What we shall hand back. Trust: the server's word, for the server itself."""
+    if not 0 < len(name) <= _NAME_CHARS or not name.isalnum():
+        raise RemoteProtocolError("the server has packages of a name that is none")
+    return name
+
+
+def _facts(facts: dict[str, object], order: m.NeedPackages) -> dict[str, Any]:
+    """What is kept for the provenance. Trust: the server's word, checked for its types alone."""
+    lock, pins = (facts.get(name) for name in _FACTS)
+    if not isinstance(lock, str) or not isinstance(pins, (list, tuple)) or len(pins) > _MAX_PINS:
+        raise RemoteProtocolError("the server does not say which packages it has made")
+    texts = [printable(str(pin)[:_MAX_CHARS], _MAX_CHARS) for pin in pins]
+    kept = {"lock": printable(lock[:_MAX_CHARS], _MAX_CHARS), "packages": texts}
+    inferred = _inferred(facts.get("inferred"), order)
+    return {**kept, "inferred": inferred} if inferred else kept
+
+
+def _inferred(said: object, order: m.NeedPackages) -> list[dict[str, str]]:
+    """What was taken that nothing declares, of what we have guessed. Trust: the server's word."""
+    rows = said if isinstance(said, (list, tuple)) else ()
+    modules = {str(row.get("module")) for row in rows[:_MAX_PINS] if isinstance(row, dict)}
+    return [
+        {"module": module, "requirement": requirement, "where": where}
+        for requirement, where, module, _ in cast("tuple[tuple[str, ...], ...]", order.guesses)
+        if module in modules
+    ]
+
+
+@dataclass(eq=False)
+class UploadedRepository(Sandbox):
+    """The sandbox of one repository, whose files are brought to its server.
+
+    Attributes:
+        order: What the packages were made of that the server has made for it; None without any.
+        packages: What the server called them.
+    """
+
+    snapshot: Path
+    order: m.NeedPackages | None
+    packages: str
+    _files: dict[Path, tuple[Sent, ...]] = field(default_factory=dict, init=False)
+
+    def prepare(
+        self, order: m.OpenJail, server: WorkerServer, client: WorkerConnection, deadline: Deadline
+    ) -> m.OpenJail:
+        """Bring the files there, and see that the packages are. One of our threads at a time."""
+        with server.uploading:
+            if self.order is not None:
+                self._check_packages(self.order, client, deadline)
+            here = {copy.tree for copy in order.repositories if copy.tree}
+            trees = {tree: self._bring(Path(tree), client, deadline) for tree in sorted(here)}
+            snapshot = self._bring(self.snapshot, client, deadline)
+        order = m.replace(order, hub_copies=order.with_trees(trees))
+        return m.replace(order, snapshot=snapshot, python="", packages=self.packages)
+
+    def _bring(self, root: Path, client: WorkerConnection, deadline: Deadline) -> str:
+        """What the server calls a folder of files, once it has them."""
+        if root not in self._files:
+            self._files[root] = listing(root)
+        return upload(client, root, self._files[root], deadline)[0]
+
+    def _check_packages(
+        self, order: m.NeedPackages, client: WorkerConnection, deadline: Deadline
+    ) -> None:
+        """Have the server make the packages again, if it is a new one or has removed them. That
+        does not count for the timeout of a start.
+        """
+        began = time.monotonic()
+        deadline.postpone(_MAKE_S)
+        try:
+            made = request_packages(order, client, deadline)
+        finally:
+            deadline.postpone(time.monotonic() - began - _MAKE_S)
+        if made is None or made.packages != self.packages:
+            raise DependencyError(
+                "the server no longer has these packages, and would choose other versions now: "
+                "make the environment again"
+            )

@@ -1,0 +1,1 @@
+"""Sources of snapshots beside the Hub and folders: git, the index, assets."""

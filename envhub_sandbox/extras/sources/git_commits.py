@@ -1,0 +1,359 @@
+"""The files of one commit of a git repository, as data; ``GitHost`` has the Hub's interface.
+
+Git gets no settings but ours: no hooks, no filters, no submodules, no logins, and no protocol but
+https. Nothing is checked out: files are read out of the objects, whose names are hashes of their
+content, so that a full commit names all of them. Snapshots and sources of packages both come by it.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
+
+from envhub_sandbox.errors import (
+    HubReferenceError,
+    SnapshotError,
+    SnapshotIntegrityError,
+    SnapshotTooLargeError,
+)
+from envhub_sandbox.extras.sources import git_address as address
+from envhub_sandbox.hub.answers import HubFailure, Kind
+from envhub_sandbox.hub.grammar import is_commit
+from envhub_sandbox.hub.listing import (
+    GIT_SHA1,
+    CommitFiles,
+    Copier,
+    FileRecord,
+    HashMismatch,
+    Repository,
+    write_verified,
+)
+from envhub_sandbox.system.log import SNAPSHOT
+from envhub_sandbox.system.platform import IS_LINUX, kill_group, own_group, own_variables
+from envhub_worker.protocol.text import printable, size_text
+
+if sys.platform != "win32":
+    import resource
+
+
+MAX_BYTES = 2 * 2**30
+"""Of a file that git writes: what it fetches, and all files of a commit, unpacked."""
+MAX_FILES = 50_000
+_MAX_ROW_BYTES = 2048
+"""Of a file in git's listing: its names have no limit there, and each repeats those above it."""
+TIMEOUT_S = 900.0
+"""For all that git does for one commit."""
+_BLOCK = 1 << 20
+_SAID_BYTES = 1000
+_ROW = re.compile(rb"(\d{6}) (\w+) ([0-9a-f]{40}) +(\d+|-)\t(.+)", re.DOTALL)
+_SETTINGS = (
+    *("protocol.allow=never", f"core.hooksPath={os.devnull}", "credential.helper="),
+    *("core.fsmonitor=false", "submodule.recurse=false", "transfer.bundleURI=false"),
+    *("gc.auto=0", "maintenance.auto=false", "core.askPass=true"),
+)
+_LIMITED = 'ulimit -f "$1" && ulimit -v "$2" && shift 2 && exec "$@"'
+"""What ``sh`` does first: git's own children have the same limits. Windows has none."""
+_MEMORY_KIB = 4 * 2**20
+_ALONE = {"GIT_TERMINAL_PROMPT": "0", "GIT_NO_LAZY_FETCH": "1", "GIT_CEILING_DIRECTORIES": "/"}
+
+
+Variables = Mapping[str, str]
+"""Of the user: what of it leads to the network is given to git."""
+
+
+def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
+    """The full commit that a branch or a tag means now; one that is full is not asked for.
+
+    Raises ``HubReferenceError`` for a URL or a name that is not taken, and ``HubFailure``.
+    """
+    if is_commit(revision):
+        return revision
+    if not re.fullmatch(address.REVISION, revision):
+        raise HubReferenceError(
+            f"{revision[:200]!r} is not a commit, tag or branch of {url[:200]!r}"
+        )
+    names = [f"refs/tags/{revision}^{{}}", f"refs/tags/{revision}", f"refs/heads/{revision}"]
+    names = ["HEAD"] if revision == "HEAD" else names
+    with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
+        git = _Git(Path(place), variables)
+        said = git.run("ls-remote", "--quiet", _checked(url), *names)
+    rows = said.decode("utf-8", "replace").splitlines()  # other names may end with these
+    found = {name: commit for commit, _, name in (row.partition("\t") for row in rows)}
+    commit = next((found[name] for name in names if name in found), "")
+    if not is_commit(commit):
+        what = f"{url} has no tag or branch {revision!r}"
+        raise HubFailure(Kind.NO_REVISION, what, "Of a commit write all 40 digits")
+    return commit
+
+
+@dataclass(frozen=True)
+class GitBlob:
+    """A file of a commit: its path, its name as an object, bytes, and which kind of file it is."""
+
+    path: str
+    digest: str
+    size: int
+    executable: bool
+    is_link: bool
+
+
+class GitFiles:
+    """What a commit holds, as long as it is here.
+
+    Attributes:
+        blobs: Its files, and its links, of which the text is the content.
+        submodules: The paths of those; nothing is fetched for them.
+    """
+
+    def __init__(self, blobs: list[GitBlob], submodules: list[str], content: IO[bytes]) -> None:
+        self.blobs = blobs
+        self.submodules = submodules
+        self._content = content
+        self._starts: dict[str, int] = {}
+        end = 0
+        for blob in blobs:  # each behind the line that ``cat-file --batch`` writes before it
+            start = end + len(f"{blob.digest} blob {blob.size}\n")
+            self._starts[blob.path] = start
+            end = start + blob.size + 1
+
+    def open(self, blob: GitBlob) -> IO[bytes]:
+        """A stream of its bytes; one at a time."""
+        return io.BufferedReader(_Part(self._content, self._starts[blob.path], blob.size))
+
+
+class _Part(io.RawIOBase):
+    """Some bytes of a file, by blocks: a stranger chose how many they are."""
+
+    def __init__(self, file: IO[bytes], start: int, size: int) -> None:
+        self._file = file
+        self._at = start
+        self._end = start + size
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        self._file.seek(self._at)
+        data = self._file.read(min(len(buffer), self._end - self._at))
+        buffer[: len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+
+@contextmanager
+def fetched(url: str, commit: str, variables: Variables | None = None) -> Iterator[GitFiles]:
+    """The files of a full commit, for as long as the context lasts.
+
+    Raises as ``resolve``, and ``SnapshotTooLargeError`` or ``SnapshotError`` for what it holds.
+    """
+    source = _checked(url)
+    title = f"{url}@{commit[:12]}"
+    with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
+        store = Path(place)
+        git = _Git(store, variables)
+        git.run("init", "--quiet", "--bare", "--template=", ".")
+        options = ("--quiet", "--depth=1", "--no-tags", "--no-recurse-submodules", "--no-auto-gc")
+        git.run("fetch", *options, source, commit)
+        submodules: list[str] = []
+        with (store / "rows").open("w+b") as file:
+            git.run("ls-tree", "-r", "-z", "-l", "--full-tree", commit, output=file)
+            file.seek(0)
+            blobs = list(_blobs(_rows(file, title), title, submodules))
+        size = sum(blob.size for blob in blobs)
+        if size > MAX_BYTES:
+            raise SnapshotTooLargeError(f"{title} has {size_text(size)} of files; that is too much")
+        with (store / "blobs").open("w+b") as file:
+            names = "".join(f"{blob.digest}\n" for blob in blobs)
+            git.run("cat-file", "--batch", given=names.encode(), output=file)
+            yield GitFiles(blobs, submodules, file)
+
+
+def _rows(file: IO[bytes], title: str) -> Iterator[bytes]:
+    """Each file of a tree. Trees that hold each other make billions of a few bytes."""
+    left = b""
+    count = 0
+    while block := file.read(_BLOCK):
+        *rows, left = (left + block).split(b"\0")
+        count += len(rows)
+        if count > MAX_FILES:
+            raise SnapshotTooLargeError(f"{title} has more than {MAX_FILES} files")
+        if any(len(row) > _MAX_ROW_BYTES for row in (*rows, left)):
+            raise SnapshotTooLargeError(f"{title} has a file with a name that is too long")
+        yield from rows
+
+
+def _blobs(rows: Iterable[bytes], title: str, submodules: list[str]) -> Iterator[GitBlob]:
+    for row in rows:
+        found = _ROW.fullmatch(row)
+        if found is None:
+            raise SnapshotError(f"{title}: git lists {row[:200]!r}")
+        mode, kind, digest, size, name = found.groups()
+        path = os.fsdecode(name)
+        if kind == b"blob":
+            executable, is_link = mode == b"100755", mode == b"120000"
+            yield GitBlob(path, digest.decode(), int(size), executable, is_link)
+        else:
+            submodules.append(path)
+
+
+def _checked(url: str) -> str:
+    if not address.is_url(url):
+        raise HubReferenceError(
+            f"{printable(url, 200)!r} is not a supported address: git+https://, a host and a path, "
+            "without a login"
+        )
+    return url
+
+
+class _Git:
+    """Git in one folder, within one deadline, with nothing of the user's settings and logins."""
+
+    def __init__(self, store: Path, variables: Variables | None) -> None:
+        self._store = store
+        self._until = time.monotonic() + TIMEOUT_S
+        ours = {"GIT_CONFIG_NOSYSTEM": "1", "GIT_CONFIG_GLOBAL": os.devnull, "HOME": str(store)}
+        theirs = os.environ if variables is None else variables
+        self._environment = {**_to_the_network(theirs), **ours, **_ALONE}
+
+    def run(self, *arguments: str, given: bytes = b"", output: IO[bytes] | None = None) -> bytes:
+        """Run git, and return the first of what it prints, where there is no file for that.
+
+        It prints into files, for which it has a limit: a pipe would bring all of it into our
+        memory.
+        """
+        program = shutil.which("git")
+        if program is None:
+            what = "a git repository has to be downloaded, and git is not installed"
+            raise HubFailure(Kind.OTHER, what, "Install it, as in 'apt-get install git'")
+        settings = [*_SETTINGS, *(f"protocol.{name}.allow=always" for name in address.PROTOCOLS)]
+        command = [program, *(word for one in settings for word in ("-c", one)), *arguments]
+        store = self._store
+        with tempfile.TemporaryFile(dir=store) as said, tempfile.TemporaryFile(dir=store) as kept:
+            try:
+                self._run_to_its_end(
+                    [*_limited(), *command], given, stdout=output or kept, stderr=said
+                )
+            except (OSError, subprocess.SubprocessError) as error:
+                late = isinstance(error, subprocess.TimeoutExpired)
+                why = f"it took longer than {TIMEOUT_S:.0f} s" if late else str(error)
+                said.seek(max(0, said.seek(0, os.SEEK_END) - _SAID_BYTES))
+                text = said.read(_SAID_BYTES).decode("utf-8", "replace") or why
+                what = f"git {arguments[0]} failed: {printable(text, _SAID_BYTES).strip()}"
+                advice = "Check the address, the commit and the network"
+                raise HubFailure(Kind.UNREACHABLE, what, advice) from error
+            kept.seek(0)
+            return kept.read(_BLOCK)
+
+    def _run_to_its_end(
+        self, words: list[str], given: bytes, stdout: IO[bytes], stderr: IO[bytes]
+    ) -> None:
+        """Nothing of it is left then, also where it took too long or we are interrupted.
+
+        Git's children ask the host, which may keep them for ever.
+        """
+        with subprocess.Popen(
+            words,
+            stdin=subprocess.PIPE,
+            stdout=stdout,
+            stderr=stderr,
+            cwd=self._store,
+            env=self._environment,
+            **own_group(),
+        ) as process:
+            try:
+                process.communicate(given, max(self._until - time.monotonic(), 0))
+            finally:
+                kill_group(process)
+        if process.returncode:
+            raise subprocess.CalledProcessError(process.returncode, "git")
+
+
+def _limited() -> tuple[str, ...]:
+    """What runs a command in limits: of a file in blocks of 512 bytes, and of memory in KiB."""
+    words: tuple[str, ...] = ()
+    if sys.platform != "win32":
+        _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+        file_bytes = MAX_BYTES if most == resource.RLIM_INFINITY else min(MAX_BYTES, most)
+        memory = str(_MEMORY_KIB) if IS_LINUX else "unlimited"  # macOS knows no such limit
+        words = "/bin/sh", "-c", _LIMITED, "sh", str(file_bytes // 512), memory
+    return words
+
+
+def _to_the_network(variables: Variables) -> dict[str, str]:
+    kept = own_variables() | {
+        name: value
+        for name, value in variables.items()
+        if name in ("PATH", "LANG") or name.lower().endswith("_proxy")
+    }
+    if certificates := variables.get("SSL_CERT_FILE"):
+        kept["GIT_SSL_CAINFO"] = os.path.abspath(os.path.expanduser(certificates))
+    return kept
+
+
+_LOOKED_AT = 64 << 10
+_SHOWN = 10
+
+
+@dataclass(frozen=True)
+class GitHost:
+    """Scheme and host of an address, in front of the repository's name."""
+
+    public_endpoint: str
+
+    def resolve(self, repo: Repository, revision: str | None) -> str:
+        """The full commit that a branch or a tag is now; None is ``HEAD``."""
+        return resolve(f"{self.public_endpoint}/{repo.repo_id}", revision or "HEAD")
+
+    @contextmanager
+    def files(self, repo: Repository, commit: str) -> Iterator[CommitFiles]:
+        """The files of a commit. Links are files with their text; submodules are left out."""
+        with fetched(f"{self.public_endpoint}/{repo.repo_id}", commit) as found:
+            title = f"{repo.repo_id}@{commit[:12]}"
+            if found.submodules:
+                shown, left = map(repr, found.submodules[:_SHOWN]), len(found.submodules) - _SHOWN
+                more = f" and {left} more" if left > 0 else ""
+                SNAPSHOT.warning("%s: submodules are left out: %s%s", title, ", ".join(shown), more)
+            if _has_lfs(found):
+                SNAPSHOT.warning("%s: of its files in LFS only the pointers are here", title)
+            records = (
+                FileRecord(blob.path, blob.size, f"{GIT_SHA1}:{blob.digest}", blob.executable)
+                for blob in found.blobs
+            )
+            yield CommitFiles(records, partial(_copier, found))
+
+
+def _has_lfs(found: GitFiles) -> bool:
+    """Whether ``.gitattributes`` at its root says so."""
+    for blob in found.blobs:
+        if blob.path == ".gitattributes":
+            with found.open(blob) as stream:
+                return b"filter=lfs" in stream.read(_LOOKED_AT)
+    return False
+
+
+def _copier(found: GitFiles, files: Sequence[FileRecord], title: str) -> Copier:
+    blobs = {blob.path: blob for blob in found.blobs}
+
+    def copy(record: FileRecord, target: Path) -> None:
+        try:
+            with found.open(blobs[record.path]) as stream:
+                write_verified(stream, target, record)
+        except HashMismatch as mismatch:
+            raise SnapshotIntegrityError(
+                f"{title}: git returned {mismatch.found} as {record.path!r}, which is "
+                f"{record.digest}. Nothing of it was used; try again, with another git"
+            ) from mismatch
+
+    return copy

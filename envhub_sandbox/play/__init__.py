@@ -1,0 +1,1 @@
+"""Plays episodes, for ``envhub run`` and for checks."""

@@ -1,0 +1,271 @@
+"""A server's figures: its operator sees all of them, a client what concerns it.
+
+Plain values, made on the server's own thread and never changed afterwards, so that another may read
+them. Clients go by name, and what is counted by a word of theirs has a fixed list of words. What
+jails take of the processor and of memory is looked at now and then (``Usage``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import shutil
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from envhub_worker import __version__
+from envhub_worker.extras.access.quotas import Rules
+from envhub_worker.lockdown.mechanisms import procfs
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.text import printable
+from envhub_worker.supervisor.records import JailRecord
+
+MAX_CLIENTS = 256
+"""Names that are kept apart; what comes after them is one."""
+OTHERS = "(others)"
+OPERATIONS = ("make_env", "reset", "step", "call", "get_attr", "set_attr", "render", "close")
+"""What requests are counted by; a client may call its own anything."""
+REFUSALS = (
+    *("sessions", "jails", "runners", "memory", "inflight", "draining", "packages"),
+    *("PolicyError", "SandboxUnavailableError", "SnapshotIntegrityError", "VersionMismatchError"),
+    *("LocalProtocolError", "WorkerError", "WorkerDiedError", "HelloError"),
+)
+"""Quotas first, then names of errors."""
+_OTHER = "other"
+_NAME_CHARS = 64
+EVERY_S = 5.0
+_MOST_PROCESSES = 65_536
+_TICKS_A_S = os.sysconf("SC_CLK_TCK")
+_PAGE = os.sysconf("SC_PAGE_SIZE")
+_USER, _SYSTEM, _STARTED, _RESIDENT = 11, 12, 19, 21
+"""Places in ``/proc/PID/stat`` after the command (proc(5)), where the state is 0."""
+
+
+@dataclass
+class Tally:
+    """What has happened since the start."""
+
+    refusals: Counter[str] = field(default_factory=Counter)
+    requests: dict[str, Counter[str]] = field(default_factory=dict)
+    opened: Counter[str] = field(default_factory=Counter)
+
+    def refused(self, error: str, quota: str) -> None:
+        """A request was not carried out; ``quota`` where that was for want of room."""
+        word = quota if quota in REFUSALS else error
+        self.refusals[word if word in REFUSALS else _OTHER] += 1
+
+    def asked(self, client: str, operation: str) -> None:
+        """A client has asked something of its runners."""
+        word = operation if operation in OPERATIONS else _OTHER
+        self.requests.setdefault(self._known(client), Counter())[word] += 1
+
+    def open(self, client: str) -> None:
+        """A client's jail has come up."""
+        self.opened[self._known(client)] += 1
+
+    def _known(self, client: str) -> str:
+        many = len(self.requests.keys() | self.opened.keys()) >= MAX_CLIENTS
+        return OTHERS if many and client not in (*self.requests, *self.opened) else client
+
+
+def facts_for_clients(rules: Rules) -> dict[str, Any]:
+    """What a client may know of a server."""
+    return {
+        "version": __version__,
+        "protocol": m.VERSION,
+        "python": platform.python_version(),
+        "profile": rules.profile,
+        **asdict(rules.permissions),
+        "quotas": asdict(rules.quotas),
+    }
+
+
+def facts_for_operators(rules: Rules, state: str) -> dict[str, Any]:
+    """What is the operator's own business; keys and snapshots lie below ``state``."""
+    try:
+        disk = shutil.disk_usage(state)
+        size, free = disk.total, disk.free
+    except OSError:
+        size = free = 0
+    return {
+        "pid": os.getpid(),
+        "pid_namespace": pid_namespace(),
+        "max_connections": rules.max_connections,
+        "disk": {"size_bytes": size, "free_bytes": free},
+    }
+
+
+def pid_namespace() -> str:
+    """Where our process numbers hold; empty if the kernel does not say."""
+    with contextlib.suppress(OSError):
+        return os.readlink("/proc/self/ns/pid")
+    return ""
+
+
+@dataclass(frozen=True)
+class Process:
+    """One look at a process.
+
+    Attributes:
+        started: When it was started, so that the number is not taken for another's.
+        memory_bytes: Its share of what it has in memory; all of that where the share is not known.
+    """
+
+    pid: int
+    started: int
+    cpu_s: float
+    memory_bytes: int
+
+
+class Usage:
+    """Memory, and processor time so far, of each client's jails.
+
+    A thread of its own looks: reading ``/proc`` of many processes takes milliseconds that no client
+    shall wait for. A process that came and went between two looks is not seen.
+
+    Attributes:
+        memory_bytes: By client, at the last look; replaced, never changed.
+        cpu_s: By client, since the start; likewise.
+    """
+
+    def __init__(self, failed: Callable[[Exception], None]) -> None:
+        self._failed = failed
+        self.memory_bytes: Mapping[str, int] = {}
+        self.cpu_s: Mapping[str, float] = {}
+        self._jails: Mapping[int, str] = {}
+        self._seen: dict[tuple[int, int], float] = {}
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="envhub usage", daemon=True)
+
+    def watch(self, jails: Mapping[int, str]) -> None:
+        """From now on look at these: jails' first pids, and whose they are."""
+        self._jails = jails
+        if jails and self._thread.ident is None:
+            self._thread.start()
+
+    def _watch(self) -> None:
+        while not self._stop.wait(EVERY_S):
+            try:
+                self.look()
+            except Exception as error:
+                self._failed(error)
+
+    def look(self) -> None:
+        """Look once."""
+        memory, spent = Counter[str](), dict(self.cpu_s)
+        seen: dict[tuple[int, int], float] = {}
+        for process, client in _members(self._jails):
+            name = process.pid, process.started
+            seen[name] = process.cpu_s
+            memory[client] += process.memory_bytes
+            more = max(0.0, process.cpu_s - self._seen.get(name, 0.0))
+            spent[client] = spent.get(client, 0.0) + more
+        self.memory_bytes, self.cpu_s, self._seen = memory, spent, seen
+
+    def close(self) -> None:
+        """Look no more."""
+        self._stop.set()
+
+
+def _members(jails: Mapping[int, str]) -> Iterator[tuple[Process, str]]:
+    """All processes of the jails: each one's first, and what it has below it."""
+    known = set[int]()
+    for first, client in jails.items():
+        waiting = [first]
+        while waiting and len(known) < _MOST_PROCESSES:
+            pid = waiting.pop()
+            found = None if pid in known else look_at(pid)
+            if found is not None:
+                known.add(pid)
+                yield found, client
+                waiting += children(pid)
+
+
+def look_at(pid: int) -> Process | None:
+    """A process as the kernel describes it, or None if it has gone."""
+    try:
+        words = procfs.stat(pid)
+        spent = (int(words[_USER]) + int(words[_SYSTEM])) / _TICKS_A_S
+        resident = int(words[_RESIDENT]) * _PAGE
+        started = int(words[_STARTED])
+        return Process(pid, started, spent, _share(pid, resident))
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+def _share(pid: int, resident: int) -> int:
+    """What a process would give back: pages that it shares count in part."""
+    with contextlib.suppress(OSError):
+        return procfs.numbers(f"/proc/{pid}/smaps_rollup").get(b"Pss", resident)
+    return resident
+
+
+def children(pid: int) -> list[int]:
+    """The numbers of a process's children; none where the kernel does not tell."""
+    found = list[int]()
+    with contextlib.suppress(OSError):
+        for thread in os.listdir(f"/proc/{pid}/task"):
+            found += map(int, procfs.content(f"/proc/{pid}/task/{thread}/children").split())
+    return found
+
+
+@dataclass
+class Client:
+    """One client's share, of all its keys that have this name."""
+
+    sessions: int = 0
+    jails: int = 0
+    runners: int = 0
+    memory_limit_bytes: int = 0
+    memory_bytes: int = 0
+    cpu_s: float = 0.0
+    upload_bytes: int = 0
+    inflight_bytes: int = 0
+    opened: int = 0
+    requests: dict[str, int] = field(default_factory=dict)
+
+    def add_jail(self, entry: JailRecord) -> None:
+        """Count an open jail."""
+        self.jails += 1
+        self.runners += len(entry.links)
+        self.memory_limit_bytes += entry.jail.spec.confinement.limits.memory_bytes
+
+
+class ClientFigures:
+    """The shares of all clients, by name, and of no more names than can be counted."""
+
+    def __init__(self) -> None:
+        self.shares: dict[str, Client] = {}
+
+    def of(self, name: str) -> Client:
+        """A client's share."""
+        if name not in self.shares and len(self.shares) >= MAX_CLIENTS:
+            name = OTHERS
+        return self.shares.setdefault(name, Client())
+
+    def add_past(self, tally: Tally, usage: Usage) -> None:
+        """What they have done, those that have gone included."""
+        for name, requests in tally.requests.items():
+            self.of(name).requests = dict(requests)
+        for name, opened in tally.opened.items():
+            self.of(name).opened = opened
+        for name, spent in usage.cpu_s.items():
+            self.of(name).cpu_s += spent
+        for name, memory in usage.memory_bytes.items():
+            self.of(name).memory_bytes += memory
+
+    def plain(self, name: str | None = None) -> Mapping[str, Any]:
+        """As plain values: of everybody, or of one."""
+        chosen = self.shares if name is None else {name: self.of(name)}
+        return {one: asdict(share) for one, share in chosen.items()}
+
+
+def client_name(name: str | None, insecure: bool) -> str:
+    """What a key's owner is called in figures; the list that names it is the operator's."""
+    if name is None:
+        return "anybody" if insecure else "operator"
+    return printable(" ".join(name[:_NAME_CHARS].split()))

@@ -1,0 +1,267 @@
+"""A TCP port whose clients prove a key before they are heard; it bounds peers without rules.
+
+``CurvePort`` answers ZeroMQ's authentication protocol (ZAP, https://rfc.zeromq.org/spec/27) in the
+server's own loop. pyzmq's authenticators have a thread or an event loop of their own; the server
+has one thread and one poll, so this asks for no lock.
+
+``ConnectionLimiter`` knows which connections are open, and lets no more in while there are too many
+of them. Strangers make them, too, and each takes a descriptor and memory before any key is asked
+for. libzmq cannot pause its listener, and ends a listener's connections with it. So a filter has
+the kernel drop what knocks: connections that are open stay, and who knocks again later is let in.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import socket
+import stat
+import struct
+from collections.abc import Callable
+from functools import partial
+
+import zmq
+
+from envhub_worker.extras.access.audit.log import Log
+from envhub_worker.extras.access.keys import KeyPair
+from envhub_worker.loop import Loop, receive
+from envhub_worker.protocol.keys import KEY_BYTES
+from envhub_worker.server.gate import Incoming
+
+_HANDSHAKE_MS = 5_000
+_HEARTBEAT_MS = 15_000
+_HEARTBEAT_TIMEOUT_MS = 60_000
+_BACKLOG = 64
+_SNDHWM = 32
+_ENDPOINT = "inproc://zeromq.zap.01"
+_VERSION = b"1.0"
+_FRAMES = 9
+_DOMAIN = b"envhub"
+ANYBODY = bytes(KEY_BYTES)
+"""The key of clients that have none, behind ``--insecure-loopback``."""
+
+_FAILED = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+_EVENTS = _FAILED | zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
+_EVENT = struct.Struct("=HI")  # a monitor's first frame: what, and a number (zmq_socket_monitor(3))
+_SO_ATTACH_FILTER = 26
+_SO_DETACH_FILTER = 27
+_DROP = struct.pack("=HBBI", 0x06, 0, 0, 0)  # BPF: return 0 bytes of the packet
+
+
+class CurvePort:
+    """What a ``RemoteGate`` does at its socket.
+
+    Args:
+        keys: The server's key pair; None only for ``--insecure-loopback``.
+        admits: Called with a client's public key and address; whether it may come in.
+        max_connections: Of everybody together, strangers included.
+    """
+
+    def __init__(
+        self,
+        keys: KeyPair | None,
+        admits: Callable[[bytes, str], bool],
+        log: Log,
+        max_connections: int,
+    ) -> None:
+        self._keys, self._admits = keys, admits
+        self._log, self._max_connections = log, max_connections
+        self._limiter: ConnectionLimiter | None = None
+        self._zap: zmq.Socket[bytes] | None = None
+
+    def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
+        """CURVE, and what bounds a peer that keeps none of the rules."""
+        router.setsockopt(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
+        router.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
+        router.setsockopt(zmq.HEARTBEAT_TIMEOUT, _HEARTBEAT_TIMEOUT_MS)
+        router.setsockopt(zmq.BACKLOG, _BACKLOG)
+        router.setsockopt(zmq.SNDHWM, _SNDHWM)
+        self._limiter = ConnectionLimiter(router, loop, self._log, self._max_connections)
+        if self._keys is None:
+            return
+        self._zap = router.context.socket(zmq.ROUTER)
+        self._zap.setsockopt(zmq.LINGER, 0)
+        self._zap.bind(_ENDPOINT)
+        loop.watch(self._zap, partial(self._answer, self._zap))
+        router.setsockopt(zmq.CURVE_SERVER, 1)
+        router.setsockopt(zmq.CURVE_SECRETKEY, self._keys.secret)
+        router.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN)
+        # without it libzmq lets everybody in whom no handler was there to ask about
+        router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
+
+    def _answer(self, zap: zmq.Socket[bytes]) -> None:
+        """Answer every question of libzmq's about a handshake that is there."""
+        while True:
+            try:
+                frames = zap.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            # return address, empty, version, id, domain, address, routing id, mechanism, key
+            key = self._admitted(frames)
+            status = [b"200", b"OK", key.hex().encode()] if key else [b"400", b"not known", b""]
+            # the last frame is metadata; the one before it becomes the messages' User-Id
+            zap.send_multipart([frames[0], b"", _VERSION, frames[3], *status, b""])
+
+    def _admitted(self, frames: list[bytes]) -> bytes:
+        if len(frames) != _FRAMES or frames[2] != _VERSION or frames[4] != _DOMAIN:
+            return b""
+        address, mechanism, key = frames[5], frames[7], frames[8]
+        if mechanism != b"CURVE" or not self._admits(key, address.decode("ascii", "replace")):
+            return b""
+        return key
+
+    def receive(self, router: zmq.Socket[bytes]) -> Incoming:
+        """The key is the one that was proved in the handshake, never what the peer claims."""
+        identity = router.recv(zmq.NOBLOCK)
+        # not of the frame before: libzmq 4.3.4 knows nothing of who sent the first one
+        header = router.recv(zmq.NOBLOCK, copy=False)
+        rest = receive(router) if header.more else []
+        frames = [header.bytes, *rest]
+        return Incoming(identity, self._key_of(header), frames, _descriptor_of(header))
+
+    def _key_of(self, frame: zmq.Frame) -> bytes:
+        if self._keys is None:
+            return ANYBODY
+        try:
+            return bytes.fromhex(str(frame.get("User-Id")))
+        except (zmq.ZMQError, ValueError):
+            return b""
+
+    def wire(self, descriptor: int) -> int | None:
+        """The connection that a message came over; None if that is not known."""
+        if self._limiter is None or descriptor < 0:
+            return None
+        return self._limiter.wire(descriptor)
+
+    def open_wires(self) -> frozenset[int] | None:
+        """The connections that are there; None if they are not counted."""
+        return None if self._limiter is None else self._limiter.open_wires()
+
+    def tick(self) -> None:
+        """Time has passed."""
+        if self._limiter is not None:
+            self._limiter.tick()
+
+    def close(self) -> None:
+        """Close the sockets of the handshakes."""
+        if self._limiter is not None:
+            self._limiter.close()
+        if self._zap is not None:
+            self._zap.close()
+
+
+def _descriptor_of(frame: zmq.Frame) -> int:
+    try:
+        return int(frame.get(zmq.SRCFD))
+    except (zmq.ZMQError, ValueError):
+        return -1
+
+
+class ConnectionLimiter:
+    """Watches a socket's connections. To be made before it is bound.
+    ``limit``: connections at once. The backlog may come in besides.
+    """
+
+    def __init__(self, router: zmq.Socket[bytes], loop: Loop, log: Log, limit: int) -> None:
+        self._router = router
+        self._log = log
+        self._limit = limit
+        self._open = 0
+        self._accepted = 0
+        self._wires: dict[int, int] = {}
+        self._shut_listener: socket.socket | None = None
+        self._monitor = router.get_monitor_socket(_EVENTS)
+        loop.watch(self._monitor, self._drain)
+
+    def _drain(self) -> None:
+        while True:
+            try:
+                frames = self._monitor.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            self._happened(*_EVENT.unpack_from(frames[0]))
+
+    def _happened(self, event: int, value: int) -> None:
+        if event == zmq.EVENT_ACCEPTED:
+            self._open += 1
+            self._accepted += 1
+            self._wires[value] = self._accepted
+            if self._open >= self._limit and self._shut_listener is None:
+                self._shut()
+        elif event == zmq.EVENT_DISCONNECTED:
+            self._open -= 1
+            self._wires.pop(value, None)
+        else:
+            self._log.say("handshake_failed", why="no key, another server's, or noise")
+
+    def wire(self, fd: int) -> int:
+        """The number of the connection that a message has come from; 0 if that has ended since.
+
+        A descriptor's number is given out again, this one never, and none has 0.
+        """
+        self._drain()  # libzmq says that it has accepted before it hands anything on
+        return self._wires.get(fd, 0)
+
+    def open_wires(self) -> frozenset[int]:
+        """The numbers of all connections that are there now."""
+        self._drain()
+        return frozenset(self._wires.values())
+
+    def _shut(self) -> None:
+        """Without descriptors or permission it stays open, and the next one tries again."""
+        listener = None
+        try:
+            listener = _listener(str(self._router.get_string(zmq.LAST_ENDPOINT)))
+            if listener is None:
+                return
+            program = ctypes.create_string_buffer(_DROP)
+            filters = struct.pack("@HP", 1, ctypes.addressof(program))
+            listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filters)
+        except OSError as error:
+            if listener is not None:
+                listener.close()
+            self._log.say("connections_full", connections=self._open, why=f"and no end: {error}")
+            return
+        self._shut_listener = listener
+        self._log.say("connections_full", connections=self._open, why="no more for the moment")
+
+    def tick(self) -> None:
+        """Let others in once there is room."""
+        if self._shut_listener is not None and self._open < self._limit:
+            with contextlib.suppress(OSError):  # there is no filter any more
+                self._shut_listener.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
+            self._shut_listener.close()
+            self._shut_listener = None
+
+    def close(self) -> None:
+        """Stop watching."""
+        # libzmq waits where many events are not read, and holds what ``disable_monitor`` asks for
+        self._drain()
+        if self._shut_listener is not None:
+            self._shut_listener.close()
+        # in this order: a context does not end while the monitor's other end is open
+        self._router.disable_monitor()
+        self._monitor.close()
+
+
+def _listener(endpoint: str) -> socket.socket | None:
+    """The listening socket of an endpoint of ours: the kernel names it, libzmq does not."""
+    port = int(endpoint.rpartition(":")[2])
+    for name in os.listdir("/proc/self/fd"):
+        fd = int(name)
+        with contextlib.suppress(OSError):  # it is closed by now, or there are too many
+            if stat.S_ISSOCK(os.fstat(fd).st_mode) and _listens_on(fd, port):
+                return socket.socket(fileno=os.dup(fd))
+    return None
+
+
+def _listens_on(fd: int, port: int) -> bool:
+    found = socket.socket(fileno=fd)
+    try:
+        if found.family not in (socket.AF_INET, socket.AF_INET6):
+            return False
+        accepts = found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+        return bool(accepts) and found.getsockname()[1] == port
+    finally:
+        found.detach()  # it is libzmq's

@@ -1,0 +1,281 @@
+"""Room for a client's sessions and jails, within the quotas of its key, and its end.
+
+First come, first served, among the processes of one key. A session ends when nothing holds it any
+more; one whose process has gone also where its place is needed. A server that drains has no room.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from envhub_worker.extras.access.audit.log import Events, Log
+from envhub_worker.extras.access.quotas import RETRY_S, BusyError, Quotas, Use, check_jail, use_of
+from envhub_worker.extras.access.store.uploads import Uploads
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.messages.server import DRAINING, Busy
+from envhub_worker.server.sessions import WATCHER, Session, Sessions
+from envhub_worker.supervisor.jails import Jails
+from envhub_worker.supervisor.records import Asker, JailRecord
+
+_PATIENCE_S = 5.0
+_MAX_WAITING = 1024
+_PLACE_NEEDED = "its client is gone, and its key needed the place"
+_FORGOTTEN_S = 3600.0
+"""Where silent clients keep their jails, those without any are forgotten after so long."""
+_QUIET_S = 1.0
+"""Between the end of the last jail and the server's own: its client learns why from this one."""
+
+
+@dataclass
+class _Waiting:
+    asked: float
+    times: int = 1
+
+
+class Line:
+    """The order in which clients first asked, as long as they go on asking.
+
+    A client that has asked once may not mean to wait, and so delays no other; one that asks again
+    does.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._waiting: dict[bytes, OrderedDict[bytes, _Waiting]] = {}
+
+    @property
+    def waiting(self) -> int:
+        """How many mean to wait: they have asked more than once, and not long ago."""
+        now = self._clock()
+        return sum(
+            one.times > 1 and now - one.asked <= _PATIENCE_S
+            for waiting in self._waiting.values()
+            for one in waiting.values()
+        )
+
+    def ahead(self, key: bytes, owner: bytes) -> int:
+        """How many wait that have come before."""
+        waiting, now = self._waiting.get(key, OrderedDict()), self._clock()
+        for name in [name for name, one in waiting.items() if now - one.asked > _PATIENCE_S]:
+            del waiting[name]
+        before = 0
+        for name, one in waiting.items():
+            if name == owner:
+                break
+            before += one.times > 1
+        return before
+
+    def wait(self, key: bytes, owner: bytes) -> None:
+        """A client is to ask again."""
+        waiting = self._waiting.setdefault(key, OrderedDict())
+        known = waiting.get(owner)
+        if known is not None:
+            known.asked, known.times = self._clock(), known.times + 1
+        elif len(waiting) < _MAX_WAITING:
+            waiting[owner] = _Waiting(self._clock())
+
+    def leave(self, key: bytes, owner: bytes) -> None:
+        """A client has been let in."""
+        waiting = self._waiting.get(key, OrderedDict())
+        waiting.pop(owner, None)
+        if not waiting:
+            self._waiting.pop(key, None)
+
+
+class Places:
+    """Finds a place, or raises ``BusyError``, and ends what has no right to one any more.
+
+    Args:
+        idle_s: How long the jails of a client that says nothing live on; 0 for ever.
+        open_wires: The connections that are there now; None if they are not counted.
+
+    Attributes:
+        lines: The clients that wait, by quota.
+    """
+
+    def __init__(
+        self,
+        quotas: Quotas,
+        idle_s: int,
+        sessions: Sessions,
+        jails: Jails,
+        uploads: Uploads,
+        events: Events,
+        open_wires: Callable[[], frozenset[int] | None],
+    ) -> None:
+        self._quotas, self._idle_s = quotas, idle_s
+        self._sessions, self._jails = sessions, jails
+        self._uploads, self._events, self._open_wires = uploads, events, open_wires
+        self.lines = {"sessions": Line(), "jails": Line()}
+
+    def for_session(self, key: bytes, name: bytes) -> None:
+        """Hold a session against the quota."""
+        of_key = self._sessions.of_key(key)
+        others = [one for one in of_key if one.name not in (name, WATCHER)]
+        quota = self._quotas.sessions
+        if name != WATCHER and len(others) >= quota:
+            gone = longest_gone(others)
+            if gone is None:
+                self.lines["sessions"].wait(key, name)
+                raise BusyError(
+                    Busy("sessions", len(others), quota, RETRY_S),
+                    f"your key has {quota} sessions, which is the server's quota (--max-sessions)",
+                )
+            self.end(gone, _PLACE_NEEDED)
+        elif name not in {one.name for one in of_key}:
+            self._refuse_behind("sessions", key, name, len(others), quota)
+        self.lines["sessions"].leave(key, name)
+
+    def for_jail(self, asker: Asker, more: Use) -> None:
+        """Hold a jail, or further runners of one, against the quotas."""
+        key = asker.key
+        check_jail((), more, self._quotas)  # no session ends for what never fits
+        while True:
+            try:
+                check_jail(self._uses(key), more, self._quotas)
+                break
+            except BusyError:
+                self._disconnect()
+                # its own may look so, too: what it said last is read after it has gone
+                others = [one for one in self._sessions.of_key(key) if one.owner != asker.session]
+                gone = longest_gone(others)
+                if gone is None:
+                    if "jails" in more:
+                        self.lines["jails"].wait(key, asker.session)
+                    raise
+                self.end(gone, _PLACE_NEEDED)
+        if "jails" in more:
+            used, quota = len(self._uses(key)), self._quotas.jails
+            self._refuse_behind("jails", key, asker.session, used, quota)
+            self.lines["jails"].leave(key, asker.session)
+
+    def for_slabs(self, asker: Asker, request: m.ShareSlabs) -> None:
+        """Hold slabs, of which some replace others, against the quota of memory.
+
+        Steps are possible without them: no session ends for slabs, and none waits in line.
+        """
+        parts = [part for part in request.slabs if type(part) is tuple and len(part) == 4]
+        replaced = {part[0] for part in parts if type(part[0]) is int}
+        sizes = [size for part in parts for size in part[2:] if type(size) is int and size > 0]
+        for entry in self._jails.open_ones(asker.session):
+            if entry.number == request.jail:
+                more = sum(sizes) + entry.shared_bytes(replaced) - entry.shared_bytes()
+                more_use = {"memory_bytes": max(more, 0)}
+                check_jail(self._uses(asker.key), more_use, self._quotas)
+
+    def _uses(self, key: bytes) -> list[Use]:
+        return [
+            use_of(entry.jail.spec.confinement.limits, len(entry.links), entry.shared_bytes())
+            for entry in self._jails.open_ones(key)
+        ]
+
+    def _refuse_behind(self, quota: str, key: bytes, owner: bytes, used: int, limit: int) -> None:
+        """There is room, and others of the same key have waited for it."""
+        line = self.lines[quota]
+        ahead = line.ahead(key, owner)
+        if ahead:
+            line.wait(key, owner)
+            text = f"{ahead} other processes of your key wait for the server's {quota}"
+            raise BusyError(Busy(quota, used, limit, RETRY_S), text)
+
+    # --- ends ----------------------------------------------------------------------------------
+
+    def tick(self) -> None:
+        """End the jails of clients that are not heard from, and what clients no longer hold."""
+        self.end_deserted()
+        # First: a client that times out in the loop below would otherwise be logged as having
+        # released its jails.
+        given_up = self._given_up() if self._idle_s else []
+        for session in self._sessions.idle(self._idle_s or _FORGOTTEN_S):
+            if self._idle_s:
+                self.end(session, f"its client has sent nothing for {self._idle_s} s")
+            elif not self._jails.open_ones(session.owner):
+                self.drop(session, "it has sent nothing for too long")
+        for entry in given_up:
+            self._jails.end(entry, "its client gave it up")
+
+    def end_deserted(self) -> None:
+        """Forget the connections that have gone, and the sessions that have nothing else.
+
+        A client that is only cut off loses nothing: what it had was a name. One that has jails
+        keeps them, for ``idle_s``, or until others of its key need the place.
+        """
+        self._disconnect()
+        for session in self._sessions.all():
+            if not session.connections and not self._jails.open_ones(session.owner):
+                self.drop(session, "its connections have ended")
+
+    def _disconnect(self) -> None:
+        wires = self._open_wires()
+        if wires is not None:
+            self._sessions.disconnect(wires)
+
+    def _given_up(self) -> list[JailRecord]:
+        return [
+            entry
+            for session in self._sessions.all()
+            for entry in self._jails.open_ones(session.owner)
+            if self._sessions.unheld(session, entry.number, self._idle_s)
+        ]
+
+    def end(self, session: Session, why: str) -> None:
+        """End a session and its jails."""
+        for entry in self._jails.open_ones(session.owner):
+            self._jails.end(entry, why)
+        self.drop(session, why)
+
+    def drop(self, session: Session, why: str) -> None:
+        """Forget a session."""
+        self._uploads.forget(session.owner)
+        self._sessions.drop(session)
+        self._events.left(session, why)
+
+
+def longest_gone(sessions: Sequence[Session]) -> Session | None:
+    """The session without a connection that was heard from the longest ago, if there is one."""
+    gone = [one for one in sessions if not one.connections]
+    return min(gone, key=lambda one: one.heard, default=None)
+
+
+class Drain:
+    """When a server was asked to end, and what that means for its clients.
+    ``drain_s``: how long what runs may go on; 0 waits for nothing.
+    """
+
+    def __init__(self, drain_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._drain_s = drain_s
+        self._clock = clock
+        self._until: float | None = None
+        self._quiet_since: float | None = None
+
+    @property
+    def left_s(self) -> float | None:
+        """How long what runs may go on; None before it begins."""
+        return None if self._until is None else max(0.0, self._until - self._clock())
+
+    def begin(self, log: Log) -> bool:
+        """Let nothing new in; False if there is no time to give, or it was said before."""
+        if not self._drain_s or self._until is not None:
+            return False
+        self._until = self._clock() + self._drain_s
+        log.say("draining", "info", seconds=self._drain_s)
+        return True
+
+    def quiet(self, busy: bool) -> bool:
+        """Whether no jail has been open for a moment; ``busy``: one is."""
+        now = self._clock()
+        if busy or self._quiet_since is None:
+            self._quiet_since = None if busy else now
+            return False
+        return now - self._quiet_since >= _QUIET_S
+
+    def refuse_new(self) -> None:
+        """Raise ``BusyError`` once it has begun."""
+        if self._until is not None:
+            raise BusyError(
+                Busy(DRAINING, 0, 0, RETRY_S),
+                "the server drains and accepts nothing new: try again when its replacement runs",
+            )

@@ -1,0 +1,322 @@
+"""Keys, quotas and the snapshots that clients bring along: the gate before a TCP port."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from time import monotonic, time
+from typing import Any
+
+import zmq
+
+from envhub_worker.extras.access.audit.figures import (
+    ClientFigures,
+    Tally,
+    Usage,
+    client_name,
+    facts_for_clients,
+    facts_for_operators,
+)
+from envhub_worker.extras.access.audit.log import Events, Log
+from envhub_worker.extras.access.curve_port import CurvePort
+from envhub_worker.extras.access.packages import Packages
+from envhub_worker.extras.access.places import Drain, Places
+from envhub_worker.extras.access.quotas import InFlight, Rules, check_policy, use_of
+from envhub_worker.extras.access.store.uploads import PREFIX, Uploads, wrong_with_path
+from envhub_worker.lockdown.probe import own_runtime
+from envhub_worker.lockdown.spec import confinement_from_wire
+from envhub_worker.loop import Loop
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.errors import ProtocolError
+from envhub_worker.protocol.keys import KEY_BYTES, key_text
+from envhub_worker.server.gate import Gate, Incoming, Payload
+from envhub_worker.server.sessions import WATCHER, Sessions
+from envhub_worker.supervisor.jails import Jails
+from envhub_worker.supervisor.records import Asker, JailRecord, RefusedError
+
+
+class RemoteGate(Gate):
+    """Keys, quotas and the snapshots that clients bring along."""
+
+    compresses = True
+
+    def __init__(
+        self,
+        rules: Rules,
+        uploads: Uploads,
+        packages: Packages,
+        log: Log,
+        publish: Callable[[Mapping[str, Any]], None] | None = None,
+    ) -> None:
+        self.idle_s = rules.idle_s
+        self._rules = rules
+        self._uploads = uploads
+        self._packages = packages
+        self._log = log
+        self._events = self.witness = Events(
+            log, self._name_of, lambda key: self._tally.open(self._label_of(key))
+        )
+        self._in_flight = InFlight()
+        self._drain = Drain(rules.drain_s)
+        self._publish = publish
+        self._unread = ""
+        self._tally, self._usage = Tally(), Usage(self._events.failed)
+        self._started = time()
+        self._port = CurvePort(rules.keys, self._admits, log, rules.max_connections)
+        self.handlers = {
+            m.OfferSnapshot: self._offer,
+            m.PutBlob: self._put,
+            m.KeepAlive: self._keep,
+            m.GetSessions: self._list_sessions,
+            m.NeedPackages: self._need,
+        }
+
+    def begin(self, sessions: Sessions, jails: Jails) -> None:
+        """Clients find their places among these."""
+        super().begin(sessions, jails)
+        rules, wires = self._rules, self._port.open_wires
+        self._places = Places(
+            rules.quotas, rules.idle_s, sessions, jails, self._uploads, self._events, wires
+        )
+
+    # --- the socket ----------------------------------------------------------------------------
+
+    def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
+        """CURVE, and what bounds a peer that keeps none of the rules."""
+        self._port.secure(router, loop)
+
+    def receive(self, router: zmq.Socket[bytes]) -> Incoming:
+        """The key is the one that was proved in the handshake, never what the peer claims."""
+        return self._port.receive(router)
+
+    def _admits(self, key: bytes, address: str) -> bool:
+        if self._is_known(key):
+            return True
+        # a kind of its own: noise at the port must not count away the line that an operator needs
+        self._log.say("unknown_key", key=key_text(key), address=address)
+        return False
+
+    # --- requests ------------------------------------------------------------------------------
+
+    def greet(self, arrived: Incoming, name: bytes) -> None:
+        """Refuse a sender without a key of ours, and more sessions than the quota."""
+        key = arrived.key
+        self._refuse_unless_authorized(key)
+        if len(name) > 64:
+            raise RefusedError("LocalProtocolError", "the name of a session is too long")
+        self._places.end_deserted()
+        is_new = name not in {one.name for one in self.sessions.of_key(key)}
+        if name != WATCHER and is_new:
+            self._drain.refuse_new()
+        self._places.for_session(key, name)
+        wire = self._port.wire(arrived.fd)
+        session = self.sessions.connect(arrived.identity, key, name, wire)
+        if is_new:
+            self._events.came(session)
+
+    def authorize(self, asker: Asker, request: m.Message, payload: Payload) -> m.Message:
+        """Hold a request against keys and quotas."""
+        self._refuse_unless_authorized(asker.key)
+        if isinstance(request, (m.OpenJail, m.OfferSnapshot, m.NeedPackages)):
+            self._drain.refuse_new()
+        if isinstance(request, m.OpenJail):
+            return self._authorize_open(asker, request)
+        if isinstance(request, m.StartRunners):
+            self._places.for_jail(asker, {"runners": request.runners})
+        elif isinstance(request, m.ShareSlabs):
+            self._places.for_slabs(asker, request)
+        elif isinstance(request, m.Relay):
+            self.sessions.used(asker.identity, asker.key, request.jail)
+            self._tally.asked(self._label_of(asker.key), request.operation)
+            size = sum(map(len, payload))
+            self._in_flight.add(asker.key, asker, size, self._rules.quotas.inflight_bytes)
+        return request
+
+    def _name_of(self, key: bytes) -> str | None:
+        name = self._rules.authorized.name_of(key)
+        return name if name or key not in self._rules.operators else "operator"
+
+    def _is_known(self, key: bytes) -> bool:
+        rules = self._rules
+        if rules.keys is None or key in rules.operators:
+            return True
+        return rules.authorized.name_of(key) is not None
+
+    def _refuse_unless_authorized(self, key: bytes) -> None:
+        if not self._is_known(key):
+            raise RefusedError("WorkerError", "your key is not authorised any more")
+
+    def _authorize_open(self, asker: Asker, request: m.OpenJail) -> m.OpenJail:
+        key = asker.key
+        try:
+            confinement = confinement_from_wire(request.confinement)
+        except ProtocolError as error:
+            raise RefusedError("LocalProtocolError", f"no confinement: {error}") from None
+        check_policy(request, confinement, self._rules.permissions)
+        wrong = wrong_with_path(request.entry)
+        if wrong:
+            raise RefusedError("PolicyError", f"the entry file {wrong}")
+        packages = request.runtime.packages
+        runtime = self._packages.runtime(key, packages) if packages else own_runtime()
+        use = use_of(confinement.limits, request.runners)
+        copies = self._hub_copies(key, request)
+        self._places.for_jail(asker, use)
+        return m.replace(
+            request,
+            name=request.name[:512],
+            python=runtime.python,
+            packages=runtime.packages,
+            snapshot=self._uploads.tree(key, request.snapshot),
+            hub_copies=copies,
+        )
+
+    def _hub_copies(self, key: bytes, request: m.OpenJail) -> tuple[object, ...]:
+        """With the paths of snapshots that this client has brought, and no other paths."""
+        try:
+            wanted = {copy.tree for copy in request.repositories if copy.tree}
+        except ProtocolError as error:
+            raise RefusedError("LocalProtocolError", str(error)) from None
+        return request.with_trees({one: self._uploads.tree(key, one) for one in wanted})
+
+    def _need(self, asker: Asker, request: m.NeedPackages, payload: Payload) -> m.Message:
+        return self._packages.need(asker.key, request, self.jails.packages, asker.session)
+
+    def _offer(self, asker: Asker, request: m.OfferSnapshot, payload: Payload) -> m.Message:
+        specs = [entry.jail.spec for entry in self.jails.open_ones()]
+        in_use = {one.snapshot for one in specs}
+        in_use |= {copy.tree for one in specs for copy in one.hub_copies}
+        wanted = self._uploads.offer(asker.session, asker.key, request, in_use)
+        if wanted.hashes:
+            sizes = {file[2]: file[1] for file in request.files if isinstance(file, tuple)}
+            size = sum(sizes[sha256] for sha256 in wanted.hashes)
+            digest = wanted.snapshot.removeprefix(PREFIX)
+            self._events.uploads(asker.session, digest, len(wanted.hashes), size)
+        return wanted
+
+    def _put(self, asker: Asker, request: m.PutBlob, payload: Payload) -> m.Message:
+        if len(payload) != 1:
+            raise RefusedError("LocalProtocolError", "PutBlob has one frame")
+        self._uploads.put(asker.session, asker.key, request, payload[0])
+        return m.Done()
+
+    def _keep(self, asker: Asker, request: m.KeepAlive, payload: Payload) -> m.Message:
+        session = self.sessions.find(asker.identity, asker.key)
+        if session is not None and all(type(jail) is int for jail in request.jails[:4096]):
+            self.sessions.keep(session, request.jails[:4096])
+        return m.Done()
+
+    def _list_sessions(self, asker: Asker, request: m.GetSessions, payload: Payload) -> m.Message:
+        return m.Sessions(tuple(self._sessions_of(asker.key)), self.figures(asker.key))
+
+    def answered(self, asker: Asker, reply: m.Message) -> None:
+        """Its bytes are no longer in flight; a refusal is counted and written down."""
+        self._in_flight.answered(asker)
+        if isinstance(reply, m.Refusal):
+            self._tally.refused(reply.error, reply.missing)
+            self._events.refused(asker, reply)
+
+    def _label_of(self, key: bytes) -> str:
+        return client_name(self._rules.authorized.name_of(key), self._rules.keys is None)
+
+    def figures(self, key: bytes | None = None) -> dict[str, Any]:
+        """What the server has to report: all for an operator, for any other key its own share."""
+        clients = ClientFigures()
+        for one in self.sessions.all():
+            if one.name != WATCHER:
+                clients.of(self._label_of(one.key)).sessions += 1
+        for entry in self.jails.open_ones():
+            clients.of(self._label_of(_key_of(entry))).add_jail(entry)
+        for known in {one.key for one in self.sessions.all() if one.name != WATCHER}:
+            share = clients.of(self._label_of(known))
+            share.upload_bytes += self._uploads.used_bytes(known)
+            share.inflight_bytes += self._in_flight.of(known)
+        clients.add_past(self._tally, self._usage)
+        found = {**facts_for_clients(self._rules), "draining_s": self._drain.left_s}
+        if key is not None and key not in self._rules.operators:
+            return {**found, "clients": clients.plain(self._label_of(key))}
+        looking = sum(len(one.connections) for one in self.sessions.all() if one.name == WATCHER)
+        return {
+            **found,
+            **facts_for_operators(self._rules, str(self._uploads.folder)),
+            "started": self._started,
+            "connections": max(0, len(self._port.open_wires() or ()) - looking),
+            "waiting": {quota: line.waiting for quota, line in self._places.lines.items()},
+            "refusals": dict(self._tally.refusals),
+            "deaths": dict(self.jails.deaths),
+            "clients": clients.plain(),
+        }
+
+    def _sessions_of(self, key: bytes) -> list[dict[str, Any]]:
+        self._places.end_deserted()
+        found = self.sessions.all() if key in self._rules.operators else self.sessions.of_key(key)
+        seen = [one for one in found if one.name != WATCHER]  # the one that asks, above all
+        used = {key: self._uploads.used_bytes(key) for key in {one.key for one in seen}}
+        return [
+            {
+                "client": self._name_of(one.key) or "operator",
+                "key": key_text(one.key),
+                "session": one.name.hex()[:8],
+                "heard_s": monotonic() - one.heard,
+                "connections": len(one.connections),
+                "upload_bytes": used[one.key],
+                "jails": tuple(self.jails.statuses(one.owner)),
+            }
+            for one in seen
+        ]
+
+    # --- time ----------------------------------------------------------------------------------
+
+    def tick(self) -> None:
+        """End the jails of clients that are not heard from, and what clients no longer hold."""
+        self._log.tick()
+        self._port.tick()
+        self._read_clients()
+        for session in self.sessions.all():
+            if not self._is_known(session.key):
+                self._places.end(session, "its key is not authorised any more")
+        self._places.tick()
+        self._packages.look(self.jails.packages)
+        for news in self._packages.news():
+            self._events.packages(*news)
+        if self._publish is not None:
+            self._publish(self.figures())
+        watched = {
+            entry.jail.pid: self._label_of(_key_of(entry)) for entry in self.jails.open_ones()
+        }
+        self._usage.watch({pid: label for pid, label in watched.items() if pid > 0})
+        if self._drain.left_s == 0.0:
+            for entry in self.jails.open_ones():
+                why = f"the server ends, {self._rules.drain_s} s after it was asked to"
+                self.jails.end(entry, why)
+
+    def _read_clients(self) -> None:
+        """Once a second; what is wrong with the list is said once, until it is another."""
+        try:
+            changed, why = self._rules.authorized.refresh(), ""
+        except (OSError, ValueError) as error:
+            changed, why = False, str(error)
+        if why and why != self._unread:
+            self._log.say("clients_kept_as_they_were", why=why)
+        elif changed:
+            self._log.say("clients_read", "info", clients=self._rules.authorized.count)
+        self._unread = why
+
+    def drain(self) -> bool:
+        """Refuse new sessions and jails; those that run have ``drain_s``."""
+        return self._drain.begin(self._log)
+
+    def drained(self) -> bool:
+        """Whether it may end: no jail is left, and every client had a moment to hear so."""
+        return self._drain.left_s is not None and self._drain.quiet(bool(self.jails.open_ones()))
+
+    def close(self) -> None:
+        """End all sessions; close the sockets of the handshakes."""
+        for session in self.sessions.all():
+            self._places.drop(session, "the server ends")
+        self._packages.close()
+        self._usage.close()
+        self._port.close()
+
+
+def _key_of(entry: JailRecord) -> bytes:
+    """Whose a jail is: what it is marked with begins with the key, see ``Session.owner``."""
+    return entry.session[:KEY_BYTES]

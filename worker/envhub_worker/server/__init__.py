@@ -1,0 +1,1 @@
+"""The worker server, between ZeroMQ clients and jails, and its gate."""

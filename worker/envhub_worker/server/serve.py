@@ -1,0 +1,107 @@
+"""``envhub-worker serve``: a worker server for the one client that started it.
+
+The head of ``__main__.py`` has its contract. What is heavy is imported late: the zygote is started
+before, and both import at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import os
+import select
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from envhub_worker.spawn.zygote_process import ZygoteProcess
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``serve``."""
+    parser.add_argument("--endpoint", required=True)
+    parser.add_argument("--runtime-dir", type=Path, required=True)
+    parser.add_argument("--readable-root", action="append", default=[])
+    parser.add_argument("--ready-fd", type=int)
+    parser.add_argument("--client-pidfd", type=int)
+    parser.add_argument("--fd-path", type=Path)
+    parser.add_argument("--until-eof", action="store_true")
+    parser.add_argument("--announce", action="store_true")
+    parser.add_argument("--ahead", action="store_true")
+    parser.add_argument("--python", default="")
+    parser.add_argument("--packages", default="")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run a worker server until a signal ends it or its client ends."""
+    arguments.runtime_dir.mkdir(mode=0o700, exist_ok=True)
+    try:
+        return _serve_in(arguments)
+    except BaseException as error:
+        if _client_has_gone(arguments):  # one that is there reads our log, and then removes it
+            from envhub_worker.lockdown.mechanisms.scratch import remove_tree
+
+            remove_tree(str(arguments.runtime_dir))
+        from envhub_worker.protocol.text import shortage
+
+        if short := shortage(error, "here"):
+            sys.exit(short)
+        raise
+
+
+def _client_has_gone(arguments: argparse.Namespace) -> bool:
+    fd = 0 if arguments.until_eof else arguments.client_pidfd
+    return fd is not None and bool(select.select([fd], [], [], 0)[0])
+
+
+def _serve_in(arguments: argparse.Namespace) -> int:
+    ahead = _ahead(arguments)  # before anything heavy is imported: both are at it at once
+    gc.disable()  # as in the zygote: what is imported stays
+    from envhub_worker.lockdown.mechanisms.process import raise_file_limit
+    from envhub_worker.server.server import Server
+
+    raise_file_limit()
+    gc.freeze()
+    gc.enable()
+    announced = _announced() if arguments.announce else None
+    server = Server(
+        arguments.endpoint,
+        arguments.runtime_dir,
+        arguments.readable_root,
+        0 if arguments.until_eof else arguments.client_pidfd,  # stdin is readable at its end
+        fd_path=arguments.fd_path,
+        ahead=ahead,
+    )
+    server.stop_on(signal.SIGTERM, signal.SIGINT)
+    if arguments.ready_fd is not None:
+        with contextlib.suppress(BrokenPipeError):  # a client that has gone: the loop sees it
+            os.write(arguments.ready_fd, b"ready\n")
+        os.close(arguments.ready_fd)
+    if announced is not None:
+        print(announced, flush=True)
+    server.run()
+    return 0
+
+
+def _ahead(arguments: argparse.Namespace) -> ZygoteProcess | None:
+    from envhub_worker.protocol.runtime import Runtime
+    from envhub_worker.protocol.start_variables import fixed_hash_seed
+    from envhub_worker.spawn.zygote_process import ZygoteProcess
+
+    if not arguments.ahead:
+        return None
+    runtime = Runtime(arguments.python, arguments.packages)
+    try:
+        granted = fixed_hash_seed(os.environ)
+        return ZygoteProcess(runtime, arguments.runtime_dir, granted, ahead=True)
+    except OSError:  # opening a jail in that interpreter says why
+        return None
+
+
+def _announced() -> str:
+    from envhub_worker.lockdown import probe
+
+    return probe.announcement(probe.surroundings())

@@ -1,0 +1,248 @@
+"""The worker server: ZeroMQ towards clients on one side, jails on the other.
+
+Trusted code in one thread and one poll loop. Who the clients are, and what they may, is the
+business of its gate.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from envhub_worker import __version__
+from envhub_worker.lockdown.mechanisms.scratch import remove_tree
+from envhub_worker.loop import Loop, has_message, send
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.wire import Buffer
+from envhub_worker.protocol.errors import ProtocolError
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES
+from envhub_worker.protocol.messages import compression
+from envhub_worker.protocol.text import shortage
+from envhub_worker.server.gate import Gate, Incoming, LocalGate
+from envhub_worker.server.sessions import Sessions
+from envhub_worker.spawn.zygote_process import ZygoteProcess
+from envhub_worker.supervisor.jails import Jails
+from envhub_worker.supervisor.records import AnsweredError, Asker, RefusedError
+
+_RCVHWM = 64
+_ROUND = 64
+_NO_HELLO = (
+    "a request before the Hello of its connection: a client that lost its connection, or whose "
+    "server was started anew, says Hello on the new one and asks again"
+)
+"""Messages that are served before the jails have their turn."""
+_LAST_WORDS_MS = 500
+"""For how long what was said last is sent on after a drain."""
+
+
+class Server:
+    """Serves until ``stop()``, or until the client's process ends."""
+
+    def __init__(
+        self,
+        endpoint: str,
+        runtime_dir: Path,
+        readable_roots: Sequence[str],
+        client_pidfd: int | None = None,
+        fd_path: Path | None = None,
+        gate: Gate | None = None,
+        ahead: ZygoteProcess | None = None,
+    ) -> None:
+        self._runtime_dir = runtime_dir
+        self._gate: Gate = gate or LocalGate()
+        self._sessions = Sessions()
+        self._loop = Loop(self._gate.witness.failed)
+        # ROUTER's own routing ids come from rand(), which libzmq does not seed: who can tell the
+        # next one can claim it, and that ends the process
+        ctypes.CDLL(None).srand(int.from_bytes(os.urandom(4), "little"))
+        self._context = zmq.Context()
+        self._router = self._listen(endpoint)
+        self._loop.watch(self._router, self._serve_clients)
+        self._jails = Jails(
+            self._loop,
+            self.reply,
+            runtime_dir,
+            readable_roots,
+            fd_path or runtime_dir / "fds",
+            ahead,
+            self._gate.witness,
+            local=isinstance(self._gate, LocalGate),
+        )
+        self._gate.begin(self._sessions, self._jails)
+        self._loop.tick(self._tick)
+        if client_pidfd is not None:
+            self._loop.watch(client_pidfd, self.stop)
+
+    @property
+    def endpoint(self) -> str:
+        """Where it listens, with the port that was found for it."""
+        return str(self._router.get_string(zmq.LAST_ENDPOINT))
+
+    def _tick(self) -> None:
+        self._jails.look()
+        self._gate.tick()
+        if self._gate.drained():
+            self.stop()
+
+    def stop_on(self, *signals: int, gently: Sequence[int] = ()) -> None:
+        """End the loop at these signals; to be called on the main thread.
+
+        At those of ``gently`` nothing new is taken, and a second one ends it; the first does, where
+        the gate does not wait for what runs.
+        """
+        self._loop.call_on(
+            {**dict.fromkeys(signals, self.stop), **dict.fromkeys(gently, self._drain)}
+        )
+
+    def _drain(self) -> None:
+        if not self._gate.drain():
+            self.stop()
+
+    def stop(self) -> None:
+        """End the loop after the current round."""
+        self._loop.stop()
+
+    def _listen(self, endpoint: str) -> zmq.Socket[bytes]:
+        router = self._context.socket(zmq.ROUTER)
+        router.setsockopt(zmq.LINGER, 0)
+        router.setsockopt(zmq.MAXMSGSIZE, DEFAULT_LIMITS.frame_bytes)
+        router.setsockopt(zmq.RCVHWM, _RCVHWM)
+        router.setsockopt(zmq.ROUTER_HANDOVER, 0)
+        router.setsockopt(zmq.IPV6, "[" in endpoint)
+        self._gate.secure(router, self._loop)
+        router.bind(endpoint)
+        return router
+
+    def run(self) -> None:
+        """Serve; on the way out every jail and zygote is gone."""
+        try:
+            self._loop.run()
+        finally:
+            if self._gate.drained():  # those who were refused last shall hear it
+                self._router.setsockopt(zmq.LINGER, _LAST_WORDS_MS)
+            self._jails.close()
+            self._gate.close()
+            self._router.close()
+            self._context.term()
+            remove_tree(str(self._runtime_dir))  # its owner may not be there any more
+
+    # --- clients -------------------------------------------------------------------------------
+
+    def _serve_clients(self) -> None:
+        for _ in range(_ROUND):
+            if not has_message(self._router):
+                return
+            self._serve(self._gate.receive(self._router))
+
+    def _serve(self, arrived: Incoming) -> None:
+        identity, key, frames, _ = arrived
+        if not frames:
+            return
+        session = self._sessions.find(identity, key)
+        try:
+            if self._compression(identity, key):
+                frames[:] = compression.unpack_frames(frames, DEFAULT_LIMITS)
+            number, request = m.unpack_header(frames[0])
+        except Exception as error:
+            self._refuse_unread(identity, key, frames[0], error)
+            return
+        asker = Asker(identity, number, b"" if session is None else session.owner, key)
+        try:
+            reply = self._dispatch(asker, request, arrived)
+            if reply is not None:
+                self.reply(asker, reply)
+        except AnsweredError as early:
+            self.reply(asker, early.reply)
+        except Exception as error:
+            if not isinstance(error, ProtocolError):  # that is the client's mistake
+                self._gate.witness.failed(error)
+            said = f"{type(error).__name__} on the server: {error}"
+            said = shortage(error, "on the server") or said
+            self.reply(asker, RefusedError("WorkerError", said).reply)
+
+    def _refuse_unread(self, identity: bytes, key: bytes, frame: Any, error: Exception) -> None:
+        """Answer a request that cannot be read, if at least its id can be."""
+        number = m.id_of(frame)
+        if number is None:
+            return  # not our protocol
+        said = str(error) if isinstance(error, ProtocolError) else type(error).__name__
+        refused = RefusedError("LocalProtocolError", f"the request cannot be read: {said}")
+        self.reply(Asker(identity, number, b"", key), refused.reply)
+
+    def _dispatch(self, asker: Asker, request: m.Message, arrived: Incoming) -> m.Message | None:
+        """The reply; None where it was sent, or comes later. Raises ``AnsweredError``."""
+        if isinstance(request, m.Hello):
+            return self._hello(request, arrived)
+        payload = arrived.frames[1:]
+        if not asker.session:
+            raise RefusedError("HelloError", _NO_HELLO)
+        request = self._gate.authorize(asker, request, payload)
+        if isinstance(request, m.Relay):
+            self._jails.relay(asker, request, payload)
+            return None
+        if isinstance(request, m.Agree):
+            self._agree(asker, request)
+            return None
+        if handler := _HANDLERS.get(type(request)):
+            return handler(self._jails, asker, request)
+        if special := self._gate.handlers.get(type(request)):
+            return special(asker, request, payload)
+        raise RefusedError("LocalProtocolError", f"{type(request).__name__} is no request")
+
+    def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
+        """Answer a request."""
+        self._gate.answered(asker, message)
+        header, *buffers = (
+            _packed_done(message.parts) if type(message) is m.RelayDone else m.pack(message)
+        )
+        frames = [m.with_id(header, asker.request_id), *buffers, *payload]
+        if agreed := self._compression(asker.identity, asker.key):
+            frames = compression.pack_frames(frames, agreed)
+        copy = sum(map(len, payload)) < LARGE_BYTES
+        send(self._router, [asker.identity, *frames], copy=copy)
+
+    def _compression(self, identity: bytes, key: bytes) -> str:
+        return self._sessions.compression(identity, key) if self._gate.compresses else ""
+
+    def _hello(self, request: m.Hello, arrived: Incoming) -> m.Message:
+        if request.version != m.VERSION:
+            raise RefusedError(
+                "VersionMismatchError",
+                f"the client speaks protocol {request.version}, this worker {m.VERSION}: install "
+                "the same release of envhub-sandbox on both sides",
+            )
+        if not request.session:
+            raise RefusedError("LocalProtocolError", "a session has a name")
+        self._gate.greet(arrived, request.session)
+        return m.Welcome(m.VERSION, __version__, os.getpid())
+
+    def _agree(self, asker: Asker, request: m.Agree) -> None:
+        """Answer before it holds, so that the answer itself can be read."""
+        known = compression.available() if self._gate.compresses else ()
+        chosen = next((name for name in request.compressions if name in known), "")
+        self.reply(asker, m.Agreement(str(chosen), self._gate.idle_s))
+        self._sessions.agree(asker.identity, asker.key, str(chosen))
+
+
+@lru_cache(maxsize=64)  # of small numbers, that the server has counted
+def _packed_done(parts: tuple[int, ...]) -> list[Buffer]:
+    return m.pack(m.RelayDone(parts))
+
+
+_HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], m.Message | None]] = {
+    m.OpenJail: Jails.open,
+    m.StartRunners: Jails.start_more,
+    m.KeepJail: Jails.keep,
+    m.ShareSlabs: Jails.share,
+    m.ExpireIdle: Jails.expire,
+    m.CloseJail: Jails.close_jail,
+    m.ReadOutput: Jails.read_output,
+    m.FollowOutput: Jails.follow_output,
+    m.GetStatus: Jails.status,
+}
