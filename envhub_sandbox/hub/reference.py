@@ -1,11 +1,11 @@
 """Hub references: ``[models/|spaces/|datasets/]owner/name[@revision][:path]``, and Hub URLs.
 
-And of other places: a commit of git (``hub.git.address``), and an environment that a package of the
-index registers (``hub.registered``). These are extras: ``read`` and ``check`` of such a module are
-to its references what those of ``hub.grammar`` are to the Hub's. A reference is text that somebody
-pasted, so every form that can mean only one thing works, and for every other form the error says
-what to write instead. Extends the grammar of ``lerobot.envs.utils._parse_hub_url``. Nothing is
-asked of the network.
+And of the extra ``sources``: a commit of git (``git_address``), and an environment that a package
+of the index registers (``registered``). ``read`` and ``check`` of such a module are to its
+references what those of ``hub.grammar`` are to the Hub's. A reference is text that somebody pasted,
+so every form that can mean only one thing works, and for every other form the error says what to
+write instead. Extends the grammar of ``lerobot.envs.utils._parse_hub_url``. Nothing is asked of the
+network.
 """
 
 from __future__ import annotations

@@ -228,8 +228,8 @@ def _in_store(candidates: Sequence[_Candidate], even_if_none: bool) -> str:
 def with_assets(
     snapshot: Snapshot, given: Sequence[str], hub: Mapping[str, Any], locked: Sequence[str] = ()
 ) -> Snapshot:
-    """The snapshot with its assets: see ``hub.sources.assets``. Without that extra a card's are not
-    looked for. Raises ``SandboxUnavailableError``: others are asked for.
+    """The snapshot with its assets: see ``extras.sources.assets``. Without that extra a card's are
+    not looked for. Raises ``SandboxUnavailableError``: others are asked for.
     """
     module, name = "envhub_sandbox.extras.sources.assets", "with_assets"
     if given or locked:

@@ -1,6 +1,6 @@
 """Records what an environment is asked, and what led to a death.
 
-The core's recorder records nothing. The extra ``session.crash`` has one that writes crash bundles.
+The core's recorder records nothing. The extra ``extras.crash`` has one that writes crash bundles.
 """
 
 from __future__ import annotations

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import os
 from types import ModuleType
+
+_HERE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "extras", "__init__.py")
 
 
 def find_extra(name: str) -> ModuleType | None:
     """A module of ``extras``, by its name below it; None if this copy lacks it."""
+    if not os.path.exists(_HERE):  # the interpreter may have another copy, of another version
+        return None
     module = f"{__package__}.extras.{name}"
     try:
         return importlib.import_module(module)

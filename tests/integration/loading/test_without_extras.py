@@ -6,13 +6,15 @@ import json
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
 
 from tests.support.samples import sample
-from tests.unit.docs.test_extras import extra_of
-from tests.unit.docs.test_imports import folder, modules
+from tests.unit.docs.test_distributions import built
+from tests.unit.docs.test_extras import EXTRAS
+from tests.unit.docs.test_imports import folder
 
 _COMMAND = "from envhub_sandbox.cli.app import app; app()"
 _CALLS = """
@@ -32,33 +34,35 @@ for argument, value in asked:
         print(str(error).splitlines()[0])
 """
 _ASKED = [
-    ("cfg", "pypi:minigrid#MiniGrid-Empty-5x5-v0", "a reference of pypi", "hub.registered"),
-    ("sandbox", "docker", "sandbox", "sandboxes.docker.sandbox"),
-    ("sandbox", "tcp://localhost:1", "sandbox", "sandboxes.remote"),
-    ("sandbox", ["process"], "sandbox", "sandboxes.fleet.fleet"),
-    ("lock", "pylock.toml", "lock", "dependencies.source"),
-    ("dependencies", {}, "dependencies", "dependencies.source"),
-    ("assets", ["org/data"], "assets", "hub.sources.assets"),
+    ("cfg", "pypi:minigrid#MiniGrid-Empty-5x5-v0", "a reference of pypi", "sources.registered"),
+    ("sandbox", "docker", "sandbox", "docker.sandbox"),
+    ("sandbox", "tcp://localhost:1", "sandbox", "remote.sandbox"),
+    ("sandbox", ["process"], "sandbox", "fleet.fleet"),
+    ("lock", "pylock.toml", "lock", "packages.source"),
+    ("dependencies", {}, "dependencies", "packages.source"),
+    ("assets", ["org/data"], "assets", "sources.assets"),
 ]
 """An argument, a value that needs an extra, how the error calls it, and the extra's module."""
 _RECORD = ["policy", {"record_denials": True}]
 
 
 @pytest.fixture(scope="module")
-def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with both packages, without the modules of extras."""
+def core(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what a wheel holds that is built of what is installed, without the extras."""
     root = tmp_path_factory.mktemp("core")
-    for package in ("envhub_sandbox", "envhub_worker"):
-        ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(folder(package), root / package, ignore=ignored)
-    kept = {name for name in modules() if extra_of(name) is None}
-    kept |= {name[:end] for name in kept for end in range(len(name)) if name[end] == "."}
-    for name in modules().keys() - kept:
-        path = root.joinpath(*name.split("."))
-        if path.is_dir():
-            shutil.rmtree(path)
-        path.with_suffix(".py").unlink(missing_ok=True)
-    return root
+    source, installed = root / "source", root / "installed"
+    ignored = shutil.ignore_patterns("__pycache__", *(name.split(".")[1] for name in EXTRAS))
+    for package, copy in (("envhub_sandbox", ""), ("envhub_worker", "worker/")):
+        shutil.copytree(folder(package), source / f"{copy}{package}", ignore=ignored)
+    shutil.copytree(checkout / "examples", source / "examples")
+    for file in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(checkout / file, source)
+    with zipfile.ZipFile(built("wheel", source, root / "wheel")) as wheel:
+        assert not {"extras", "integrations"} & {
+            Path(name).parent.name for name in wheel.namelist()
+        }
+        wheel.extractall(installed)
+    return installed
 
 
 def alone(core: Path, program: str, *arguments: str, code: int = 0) -> str:
@@ -81,7 +85,7 @@ def test_the_core_needs_no_extra(core: Path) -> None:
     shape, *refused, record = printed[-2 - len(_ASKED) :]
     assert shape == "(2,)"
     assert [line.partition(", which this")[0] for line in refused] == [
-        f"{what} needs envhub_sandbox.{module}" for _, _, what, module in _ASKED
+        f"{what} needs envhub_sandbox.extras.{module}" for _, _, what, module in _ASKED
     ]
     assert "installed without envhub_worker.extras.denials" in record
 

@@ -6,7 +6,7 @@ import ast
 from collections import Counter
 from itertools import chain
 
-from tests.unit.docs.test_extras import extra_of
+from tests.unit.docs.test_extras import is_extra
 from tests.unit.docs.test_imports import modules
 
 VAGUE = {
@@ -25,6 +25,6 @@ def bound_names(module: ast.Module) -> list[str]:
 
 def test_vague_names_only_get_fewer() -> None:
     """Name a value for what it is: a frame, a request, a path. Lower ``MOST`` with the number."""
-    core = [bound_names(module) for name, module in modules().items() if extra_of(name) is None]
+    core = [bound_names(module) for name, module in modules().items() if not is_extra(name)]
     vague = Counter(name for name in chain.from_iterable(core) if name in VAGUE)
     assert vague.total() <= MOST, vague.most_common()

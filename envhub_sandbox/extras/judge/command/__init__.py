@@ -1,1 +1,1 @@
-"""``envhub check``: one repository, or a list of them."""
+"""``envhub check``, of one repository or a list of them, and ``envhub diff``."""

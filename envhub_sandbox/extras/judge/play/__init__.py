@@ -1,1 +1,1 @@
-"""How a repository is played, for a verdict and by ``envhub run``, and what is seen meanwhile."""
+"""What is seen while a repository is played for a verdict."""
