@@ -59,6 +59,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         self._provenance = provenance
         self._on_close = on_close
         self._recipe = recipe
+        self._serves_lerobot = False
 
     def __missing__(self, suite: str) -> Any:
         raise KeyError(f"there is no suite {suite!r}; there are: {', '.join(map(repr, self))}")
@@ -66,6 +67,8 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
     def __reduce__(self) -> tuple[Any, ...]:
         if self._recipe is None:
             raise TypeError("environments that run in this process cannot be pickled")
+        if self._serves_lerobot:
+            return _again_for_lerobot, (self._recipe,)
         return self._recipe.make, ()
 
     @property
@@ -161,7 +164,12 @@ def for_lerobot(suites: EnvSuites) -> EnvSuites:
     for env in [env for tasks in suites.values() for env in tasks.values()]:
         if isinstance(env, SandboxVectorEnv):
             serve_lerobot(env)
+    suites._serves_lerobot = True
     return suites
+
+
+def _again_for_lerobot(recipe: Recipe) -> EnvSuites:
+    return for_lerobot(recipe.make())
 
 
 def choose(

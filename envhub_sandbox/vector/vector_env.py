@@ -43,6 +43,7 @@ from envhub_worker.protocol.manifest.names import absent, is_servable
 
 if TYPE_CHECKING:
     from envhub_sandbox.session.parts.fleet_session import AnySession
+    from envhub_sandbox.session.repository import Recipe
 
 _NOT_CALLED = frozenset({"reset", "step", "close"})
 """What ``AsyncVectorEnv.call`` refuses: it would take one sub-environment from under the others."""
@@ -507,7 +508,10 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         recipe = self._session.repository.recipe
         if recipe is None:
             raise TypeError(f"{self!r} does not know how it was made, so it cannot be pickled")
-        return recipe.make_one, (self._manifest.suite, self._manifest.task)
+        key = self._manifest.suite, self._manifest.task
+        if self._session.repository.for_lerobot:
+            return _one_for_lerobot, (recipe, *key)
+        return recipe.make_one, key
 
     def __repr__(self) -> str:
         return f"SandboxVectorEnv({self._session.repository.label}, num_envs={self.num_envs})"
@@ -546,6 +550,12 @@ def serve_lerobot(env: SandboxVectorEnv) -> None:
     """
     env._session.repository.for_lerobot = True
     env.metadata = metadata_of(env._manifest, whole=True)
+
+
+def _one_for_lerobot(recipe: Recipe, suite: str, task: int | str) -> SandboxVectorEnv:
+    env: SandboxVectorEnv = recipe.make_one(suite, task)
+    serve_lerobot(env)
+    return env
 
 
 def leave_suite(env: SandboxVectorEnv) -> None:

@@ -58,6 +58,19 @@ def test_options_and_tasks_travel() -> None:
 
 
 @pytest.mark.usefixtures("neighbour")
+@pytest.mark.parametrize("of_all", [False, True])
+def test_what_opens_again_for_lerobot_does_so_as_a_copy(*, of_all: bool) -> None:
+    with make_env(sample("faulty"), n_envs=2, trust_remote_code=True) as suites:
+        if of_all:
+            one = pickle.loads(pickle.dumps(suites)).env
+        else:
+            one = pickle.loads(pickle.dumps(suites.env))
+        one.close()
+        assert one.reset()[0].tolist() == [[0.0], [0.0]]
+        one.close()
+
+
+@pytest.mark.usefixtures("neighbour")
 def test_config_object_travels_as_its_attributes() -> None:
     config = SimpleNamespace(
         hub_path=str(sample("cfg_reader")),
