@@ -1,7 +1,7 @@
 """The entry file of the jail that sources are built in; it is copied there, and imported nowhere.
 
 It calls the build backend, which is a stranger's, in a child process, and gives the wheel back in
-pieces. Nothing of what it answers is believed: ``dependencies/builds`` checks the wheel.
+pieces. Nothing of what it answers is believed: ``extras.packages.builds`` checks the wheel.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Where a repository's packages come from: of the core, the interpreter that its jails run on.
 
-The extra ``dependencies.source`` makes packages for a repository.
+The extra ``extras.packages.source`` makes packages for a repository.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ class Sandbox:
         return runtime
 
     def package_target(self) -> Any:
-        """A ``dependencies.packages.PackageTarget``, which makes a repository's own packages for
+        """A ``PackageTarget`` of ``extras.packages``, which makes a repository's own packages for
         what runs there; None where nothing can.
 
         Asks the place nothing before it has to make some.
