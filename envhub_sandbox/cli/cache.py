@@ -116,9 +116,7 @@ def _repository(document: dict[str, Any]) -> str:
 
 
 @opt.with_options()
-def list_(
-    json: opt.Json = False,
-) -> None:
+def list_(json: opt.Json = False) -> None:
     """List snapshots, environments of packages and wheels built here, last used first."""
     from envhub_sandbox.system.folders import cache_root
 

@@ -130,11 +130,7 @@ class _Run:
                 from envhub_sandbox.play.plays import check_target
 
                 check_target(self.video)
-            with (
-                ProgressBar(quiet=self.as_json) as bar,
-                says_what_is_seen(),
-                self.make.explained(),
-            ):
+            with ProgressBar(quiet=self.as_json) as bar, says_what_is_seen(), self.make.explained():
                 self._run(bar)
         except EnvHubError as error:
             self._print(error)

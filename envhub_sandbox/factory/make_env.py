@@ -16,12 +16,7 @@ from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named, with_assets
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.sandbox import Sandbox, is_list
 from envhub_sandbox.session.launcher import Launcher
-from envhub_sandbox.session.repository import (
-    Recipe,
-    Repository,
-    plain_config,
-    provenance_of,
-)
+from envhub_sandbox.session.repository import Recipe, Repository, plain_config, provenance_of
 from envhub_sandbox.settings.options import Options, option_name, refuse_unknown_arguments
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.system import extras

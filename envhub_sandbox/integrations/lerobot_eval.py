@@ -10,11 +10,7 @@ import sys
 from importlib.util import find_spec
 from typing import Any
 
-from envhub_sandbox.settings.options import (
-    json_or_text,
-    on_lerobots_command_line,
-    use_option_names,
-)
+from envhub_sandbox.settings.options import json_or_text, on_lerobots_command_line, use_option_names
 
 _PREFIX = "--sandbox."
 

@@ -16,12 +16,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from envhub_sandbox.errors import (
-    DependencyError,
-    EnvHubError,
-    RemoteEnvError,
-    WorkerDiedError,
-)
+from envhub_sandbox.errors import DependencyError, EnvHubError, RemoteEnvError, WorkerDiedError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy

@@ -47,11 +47,7 @@ class Prewarm:
     """
 
     def __init__(
-        self,
-        lease: Lease,
-        use: UseLock,
-        recorder: Recorder,
-        recovery: Recovery | None,
+        self, lease: Lease, use: UseLock, recorder: Recorder, recovery: Recovery | None
     ) -> None:
         self.lifecycle = lease.lifecycle
         self.unused = False

@@ -46,11 +46,7 @@ class Recovery:
     """
 
     def __init__(
-        self,
-        lease: Lease,
-        restarts: Restarts,
-        failures: Failures,
-        recorder: Recorder,
+        self, lease: Lease, restarts: Restarts, failures: Failures, recorder: Recorder
     ) -> None:
         manifest = lease.results.manifest
         self._lease = lease

@@ -33,11 +33,7 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.hub.client import default_endpoint
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.session.error_text import (
-    add_author_line,
-    add_reach_advice,
-    why_missing,
-)
+from envhub_sandbox.session.error_text import add_author_line, add_reach_advice, why_missing
 from envhub_sandbox.session.recorder import Crash, Recorder, recorder_for
 from envhub_sandbox.settings.options import Options, option_name
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts

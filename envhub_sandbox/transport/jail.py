@@ -162,11 +162,7 @@ class JailHandle:
         return Request(operation, messages, frames, bounds, plain=pickler.plain)
 
     def relay(
-        self,
-        operation: str,
-        requests: Sequence[tuple[int, Frames]],
-        *,
-        deposited: bool = False,
+        self, operation: str, requests: Sequence[tuple[int, Frames]], *, deposited: bool = False
     ) -> int:
         """Send a packed message to each of some runners, in one request; returns its id.
         ``deposited``: as in ``Relay``.

@@ -53,11 +53,7 @@ class RunnersDiedError(WorkerDiedError):
     """
 
     def __init__(
-        self,
-        replies: Sequence[Any],
-        deaths: dict[int, WorkerDiedError],
-        *,
-        jail_gone: bool = False,
+        self, replies: Sequence[Any], deaths: dict[int, WorkerDiedError], *, jail_gone: bool = False
     ) -> None:
         self.first = next(iter(deaths.values()))
         super().__init__(str(self.first), reason=self.first.reason)

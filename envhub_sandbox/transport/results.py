@@ -84,9 +84,7 @@ class Results:
         )
 
     def joined_resets(
-        self,
-        parts: Sequence[tuple[Any, dict[Any, Any]]],
-        infos: dict[Any, Any] | None = None,
+        self, parts: Sequence[tuple[Any, dict[Any, Any]]], infos: dict[Any, Any] | None = None
     ) -> tuple[Any, dict[Any, Any]]:
         """Likewise of a reset."""
         observations, own = zip(*parts, strict=True)

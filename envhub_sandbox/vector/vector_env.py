@@ -26,12 +26,7 @@ from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Own, StepResult
 from envhub_sandbox.transport.values import not_here, seeds
-from envhub_sandbox.vector.actions import (
-    action_reader,
-    check_mask,
-    reset_message,
-    seeds_for_all,
-)
+from envhub_sandbox.vector.actions import action_reader, check_mask, reset_message, seeds_for_all
 from envhub_sandbox.vector.generators import Generators
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.send_recv import SendRecv
@@ -178,9 +173,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     @short_traceback
     def reset_async(
-        self,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        self, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> None:
         """Send the reset; ``reset_wait`` returns its results."""
         self._note_first_use()

@@ -71,9 +71,7 @@ def load_package() -> None:
     """Make ``import envhub_worker`` mean the folder of this file."""
     folder = os.path.dirname(os.path.abspath(__file__))
     spec = importlib.util.spec_from_file_location(
-        "envhub_worker",
-        os.path.join(folder, "__init__.py"),
-        submodule_search_locations=[folder],
+        "envhub_worker", os.path.join(folder, "__init__.py"), submodule_search_locations=[folder]
     )
     assert spec is not None
     assert spec.loader is not None

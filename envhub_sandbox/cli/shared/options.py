@@ -210,9 +210,7 @@ class MakeOptions:
 
 
 def select_envs(
-    envs: Mapping[str, Mapping[Any, Any]],
-    suites: Sequence[str] | None,
-    tasks: Sequence[str] | None,
+    envs: Mapping[str, Mapping[Any, Any]], suites: Sequence[str] | None, tasks: Sequence[str] | None
 ) -> list[tuple[str, Any, Any]]:
     """``(suite, task, env)`` for each chosen environment; all where nothing is chosen.
     Raises ``UsageError``: none fits; the text names what there is.

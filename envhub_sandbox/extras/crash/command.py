@@ -45,11 +45,7 @@ Grant = Annotated[
 
 @opt.with_options("sandbox", "profile", "python", *opt.SOURCE)
 def replay(
-    *,
-    bundle: BundleFolder,
-    grant: Grant = False,
-    json: opt.Json = False,
-    make: opt.MakeOptions,
+    *, bundle: BundleFolder, grant: Grant = False, json: opt.Json = False, make: opt.MakeOptions
 ) -> None:
     """Repeat the requests of a crash bundle, and report whether it dies in the same way.
 

@@ -10,11 +10,7 @@ import json
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from envhub_sandbox.errors import (
-    RemoteProtocolError,
-    SandboxUnavailableError,
-    WorkerStartupError,
-)
+from envhub_sandbox.errors import RemoteProtocolError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.extras.docker.run_arguments import Container
 from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.confinement import Surroundings

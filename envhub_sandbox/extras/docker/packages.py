@@ -27,10 +27,7 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from envhub_sandbox.errors import (
-    DependencyError,
-    SandboxUnavailableError,
-)
+from envhub_sandbox.errors import DependencyError, SandboxUnavailableError
 from envhub_sandbox.extras.docker.engines import (
     Engine,
     EngineError,

@@ -20,11 +20,7 @@ from typing import Any, cast
 
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.extras.docker import attestation
-from envhub_sandbox.extras.docker.container import (
-    STARTUP_S,
-    RepositoryContainer,
-    check_started,
-)
+from envhub_sandbox.extras.docker.container import STARTUP_S, RepositoryContainer, check_started
 from envhub_sandbox.extras.docker.engines import Engine, EngineError, environment
 from envhub_sandbox.extras.docker.run_arguments import (
     PORT,

@@ -336,12 +336,7 @@ def document(read: Static) -> dict[str, Any]:
         "declared": says
         and {"source": says.source, "python": says.python, "packages": list(map(str, says.wanted))},
         "imports": [
-            {
-                "name": one.name,
-                "file": one.file,
-                "line": one.line,
-                "brought": read.is_brought(name),
-            }
+            {"name": one.name, "file": one.file, "line": one.line, "brought": read.is_brought(name)}
             for name, one in sorted(read.modules.items())
         ],
         "findings": [one.document() for one in read.findings],

@@ -243,12 +243,7 @@ def _publish(building: Path, key: str, facts: dict[str, object]) -> None:
 
 
 def _install(
-    lock: Lock,
-    interpreter: Interpreter,
-    building: Path,
-    held: int,
-    watch: Watch,
-    tell: Tell,
+    lock: Lock, interpreter: Interpreter, building: Path, held: int, watch: Watch, tell: Tell
 ) -> None:
     pins = building / "lock.txt"
     pins.write_text(lock.text)

@@ -16,12 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
-from envhub_sandbox.errors import (
-    DependencyError,
-    LockError,
-    PolicyError,
-    name_source,
-)
+from envhub_sandbox.errors import DependencyError, LockError, PolicyError, name_source
 from envhub_sandbox.extras.packages.request import Choice, PackageRequest, Tell, request_of
 from envhub_sandbox.hub.reference import PYPI
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -206,10 +201,7 @@ def locked_packages(snapshot: Snapshot, lock: LockFile) -> PackageSet:
 
 
 def _with_wheels(
-    lock: Lock,
-    locked: Sequence[WheelOrigin],
-    interpreter: Interpreter,
-    tell: Tell,
+    lock: Lock, locked: Sequence[WheelOrigin], interpreter: Interpreter, tell: Tell
 ) -> Lock:
     """The lock with wheels of what has none: kept, or built again of the locked sources.
     Raises ``DependencyError`` where one cannot be built, or its source is another.

@@ -16,14 +16,7 @@ from gymnasium.spaces import Box, Dict
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.processor.pipeline import ProcessorStepRegistry
-from lerobot.utils.constants import (
-    ACTION,
-    OBS_ENV_STATE,
-    OBS_IMAGE,
-    OBS_IMAGES,
-    OBS_STATE,
-    OBS_STR,
-)
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES, OBS_STATE, OBS_STR
 
 DECLARED = "env_preprocessor"
 """The key of an environment's metadata under which a repository names processor steps."""

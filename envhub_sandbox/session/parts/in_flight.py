@@ -21,12 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.error import NoAsyncCallError
 
-from envhub_sandbox.errors import (
-    ActionError,
-    EnvHubError,
-    RemoteEnvWarning,
-    WorkerTimeoutError,
-)
+from envhub_sandbox.errors import ActionError, EnvHubError, RemoteEnvWarning, WorkerTimeoutError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.failures import refusal
 from envhub_sandbox.session.parts.shard_queue import ShardQueue

@@ -16,12 +16,7 @@ from typing import Any
 import numpy as np
 from gymnasium.error import AlreadyPendingCallError
 
-from envhub_sandbox.errors import (
-    EnvHubError,
-    RemoteEnvWarning,
-    RemoteProtocolError,
-    remote_error,
-)
+from envhub_sandbox.errors import EnvHubError, RemoteEnvWarning, RemoteProtocolError, remote_error
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.requests import MessageFor
 from envhub_sandbox.transport.deadline import Deadline

@@ -89,12 +89,7 @@ class Attachment:
 
 
 def deposit(
-    path: str,
-    session: bytes,
-    jail: int,
-    runner: int,
-    fds: Sequence[int],
-    wait_s: float = _ANSWER_S,
+    path: str, session: bytes, jail: int, runner: int, fds: Sequence[int], wait_s: float = _ANSWER_S
 ) -> int:
     """Hand descriptors to the server for a runner; returns a pidfd of the jail, or of the runner.
 

@@ -19,11 +19,7 @@ from envhub_sandbox.transport.jail import Frames
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
-from envhub_sandbox.transport.shared_memory.client_slabs import (
-    LaneShard,
-    SlotRing,
-    message_layouts,
-)
+from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard, SlotRing, message_layouts
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 

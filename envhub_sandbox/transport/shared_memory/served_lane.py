@@ -190,10 +190,7 @@ class ServedLane(Lane):
         return m.StepDone(*shard.rows(), self._infos_of(shard, outcome))
 
     def _fetch(
-        self,
-        outcomes: list[Outcome | None],
-        deaths: dict[int, WorkerDiedError],
-        deadline: Deadline,
+        self, outcomes: list[Outcome | None], deaths: dict[int, WorkerDiedError], deadline: Deadline
     ) -> None:
         """Put infos in that did not fit the slabs. Who dies meanwhile is added to the deaths."""
         missing = [i for i, one in enumerate(outcomes) if one is not None and one[0] == slabs.FETCH]

@@ -70,13 +70,13 @@ MAY_IMPORT = {
     "envhub_sandbox.extras": set(),
     "envhub_sandbox.extras.crash": {"cli", "factory", "hub", "session", "transport"},
     "envhub_sandbox.extras.docker": {
-        *("cli", "extras.packages", "extras.remote", "hub", "sandboxes", "transport"),
+        *("cli", "extras.packages", "extras.remote", "hub", "sandboxes", "transport")
     },
     "envhub_sandbox.extras.fleet": {
-        *("extras.packages", "extras.remote", "sandboxes", "transport"),
+        *("extras.packages", "extras.remote", "sandboxes", "transport")
     },
     "envhub_sandbox.extras.judge": {
-        *("", "cli", "extras.packages", "factory", "hub", "play", "vector"),
+        *("", "cli", "extras.packages", "factory", "hub", "play", "vector")
     },
     "envhub_sandbox.extras.packages": {"cli", "extras.sources", "factory", "hub"},
     "envhub_sandbox.extras.ray": {"extras.packages", "extras.remote", "sandboxes", "transport"},

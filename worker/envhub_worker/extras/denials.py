@@ -52,11 +52,7 @@ _HARMLESS = ("/var/run/nscd/socket", "/run/nscd/socket")
 
 
 def asked(
-    call: str,
-    words: Sequence[int],
-    thread: int,
-    own: OwnPaths,
-    still_waits: Callable[[], object],
+    call: str, words: Sequence[int], thread: int, own: OwnPaths, still_waits: Callable[[], object]
 ) -> list[tuple[str, str]]:
     """What a waiting call asks for and is not its own: what it would do, and each path, shown.
 

@@ -71,10 +71,7 @@ def _head_bytes(data: memoryview | bytearray, limits: WireLimits) -> int:
 
 
 def _read_head(
-    data: memoryview | bytearray,
-    size: int,
-    limits: WireLimits,
-    check: Callable[[int], None] | None,
+    data: memoryview | bytearray, size: int, limits: WireLimits, check: Callable[[int], None] | None
 ) -> tuple[int, tuple[int, ...]]:
     """A whole head's request id, and the lengths of its frames."""
     request_id = _PREFIX.unpack_from(data)[1]

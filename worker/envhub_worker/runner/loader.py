@@ -139,10 +139,7 @@ def call_make_env(make_env: Callable[..., Any], request: Load | LoadTask) -> Any
     """Call ``make_env`` with those of our arguments that it takes.
     Raises ``ArgumentsError``: it needs others, or does not take the caller's ``env_kwargs``.
     """
-    offered: dict[str, Any] = {
-        "n_envs": request.n_envs,
-        "use_async_envs": request.use_async_envs,
-    }
+    offered: dict[str, Any] = {"n_envs": request.n_envs, "use_async_envs": request.use_async_envs}
     if request.cfg is not None:
         offered["cfg"] = config_of(request.cfg)
     parameters = parameters_of(make_env)

@@ -228,12 +228,7 @@ class _Maker:
 
         self._seen.append(first)
         env_fns: list[EnvFn] = [lambda: first, *[another] * (self._n_envs - 1)]
-        return Recording(
-            env_fns=env_fns,
-            sync=self._sync,
-            autoreset_mode="NextStep",
-            arguments={},
-        )
+        return Recording(env_fns=env_fns, sync=self._sync, autoreset_mode="NextStep", arguments={})
 
 
 def _is_duck(env: Any) -> bool:

@@ -43,12 +43,7 @@ class JailEvents:
     """
 
     def __init__(
-        self,
-        loop: Loop,
-        reply: Reply,
-        jails: dict[int, JailRecord],
-        fds: FdStore,
-        witness: Witness,
+        self, loop: Loop, reply: Reply, jails: dict[int, JailRecord], fds: FdStore, witness: Witness
     ) -> None:
         self._loop = loop
         self._reply = reply

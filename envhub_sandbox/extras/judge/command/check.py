@@ -26,12 +26,7 @@ from envhub_sandbox.cli.shared.console import (
 )
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
 from envhub_sandbox.extras.judge.command.deadline import DeadlineReached, deadline_alarm
-from envhub_sandbox.extras.judge.command.findings import (
-    annotate,
-    level,
-    show_finding,
-    write_report,
-)
+from envhub_sandbox.extras.judge.command.findings import annotate, level, show_finding, write_report
 
 if TYPE_CHECKING:
     from envhub_sandbox.extras.judge.findings import Finding, Report
@@ -81,8 +76,7 @@ def check(
     resets: Annotated[
         int,
         typer.Option(
-            min=0,
-            help="Resets in each of four rounds that look for leaks; 0 skips them.",
+            min=0, help="Resets in each of four rounds that look for leaks; 0 skips them."
         ),
     ] = 8,
     slow_step: Annotated[
@@ -138,9 +132,7 @@ def check(
     listed: Annotated[
         str | None,
         typer.Option(
-            "--all",
-            metavar="FILE",
-            help="Judge a list of references, one per line; '-' is stdin.",
+            "--all", metavar="FILE", help="Judge a list of references, one per line; '-' is stdin."
         ),
     ] = None,
     deadline: Annotated[

@@ -23,12 +23,7 @@ _PLAIN = ("Python", "text")
 
 
 def inspect_static(
-    ref: str,
-    *,
-    as_json: bool,
-    sarif: Path | None,
-    fail_on: str | None,
-    make: opt.MakeOptions,
+    ref: str, *, as_json: bool, sarif: Path | None, fail_on: str | None, make: opt.MakeOptions
 ) -> None:
     """Read a repository, and say what is in it."""
     least = None if fail_on is None else level(fail_on)

@@ -36,10 +36,7 @@ Usage = dict[str, int]
 
 
 def usage_per_round(
-    begin: Callable[[], Any],
-    usage: Callable[[], Usage],
-    resets: int,
-    tell: Callable[[str], None],
+    begin: Callable[[], Any], usage: Callable[[], Usage], resets: int, tell: Callable[[str], None]
 ) -> list[Usage]:
     """What is held after each round of resets; a first round warms up. Empty if nothing counts."""
     seen = []

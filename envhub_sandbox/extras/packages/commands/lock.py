@@ -41,11 +41,7 @@ Output = Annotated[
     ),
 ]
 NoSpaces = Annotated[
-    bool,
-    typer.Option(
-        "--no-spaces",
-        help="Run nothing, and leave the environments' spaces out.",
-    ),
+    bool, typer.Option("--no-spaces", help="Run nothing, and leave the environments' spaces out.")
 ]
 
 

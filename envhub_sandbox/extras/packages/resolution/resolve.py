@@ -13,9 +13,7 @@ from functools import partial
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from envhub_sandbox.errors import (
-    DependencyError,
-)
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.extras.packages import interpreters
 from envhub_sandbox.extras.packages.declared import Source, WantedPackage, parse_requirement
 from envhub_sandbox.extras.packages.request import PackageRequest, Tell
@@ -354,9 +352,7 @@ def advice(
 
 
 def without_cuda(
-    request: PackageRequest,
-    lock: Lock,
-    resolved: Callable[[PackageRequest, Sequence[str]], Lock],
+    request: PackageRequest, lock: Lock, resolved: Callable[[PackageRequest, Sequence[str]], Lock]
 ) -> Lock:
     """The same without CUDA, where jails have no GPU and the index has such builds of PyTorch.
 

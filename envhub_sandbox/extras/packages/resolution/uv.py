@@ -283,10 +283,7 @@ def _remove_unfinished(cache: Path, since: float) -> bool:
     Each holds this lock, shared, for as long as it works; where one works on, nothing is removed,
     and False returned.
     """
-    with (
-        contextlib.suppress(OSError),
-        locks.held(cache / ".lock", wait_s=CACHE_WAIT_S),
-    ):
+    with contextlib.suppress(OSError), locks.held(cache / ".lock", wait_s=CACHE_WAIT_S):
         for path in cache.glob(".tmp*"):
             if path.lstat().st_mtime >= since:
                 remove_tree(path)

@@ -167,12 +167,7 @@ class Packages:
     """
 
     def __init__(
-        self,
-        folder: Path | None,
-        quotas: Quotas,
-        make_s: float = MAKE_S,
-        *,
-        shared: bool = False,
+        self, folder: Path | None, quotas: Quotas, make_s: float = MAKE_S, *, shared: bool = False
     ) -> None:
         self._folder = folder
         self._shared = shared

@@ -67,13 +67,7 @@ def enter_root(plan: RootPlan, root: str, copied: Sequence[str], user: int | Non
     trees |= _take(("/proc",), 0)
     files = {path: Path(path).read_bytes() for path in plan.copies}
     files |= {path: text.encode() for path, text in plan.texts.items()}
-    kernel.mount(
-        "sandbox",
-        root,
-        "tmpfs",
-        _PLAIN,
-        "size=4m,nr_inodes=4096,mode=755",
-    )
+    kernel.mount("sandbox", root, "tmpfs", _PLAIN, "size=4m,nr_inodes=4096,mode=755")
     for path in root_plan.OWN_FOLDERS:
         os.makedirs(root + path, 0o755, exist_ok=True)
     _put(trees | own, root)  # in this order: one of the latter may lie in one of the former
@@ -213,13 +207,7 @@ def mount_jail(
     buried = [path for path in trees if any(within(path, folder) for folder in hidden)]
     kept = _take((*buried, snapshot), 0)
     for folder in roots:
-        kernel.mount(
-            "hidden",
-            folder,
-            "tmpfs",
-            _PLAIN,
-            "size=64k,nr_inodes=64,mode=755",
-        )
+        kernel.mount("hidden", folder, "tmpfs", _PLAIN, "size=64k,nr_inodes=64,mode=755")
     _mount_scratch(size, inodes)
     _mount_terminals()
     _put(kept)

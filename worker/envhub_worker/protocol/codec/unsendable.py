@@ -147,11 +147,7 @@ _ATTEMPTS = 2000
 
 
 def explain(
-    value: object,
-    error: Exception,
-    limits: WireLimits,
-    send: Send,
-    names: Sequence[str] = (),
+    value: object, error: Exception, limits: WireLimits, send: Send, names: Sequence[str] = ()
 ) -> str:
     """Says what cannot be sent, and where in the value it is."""
     misfit = _Search(limits, send).first(value, (), ())

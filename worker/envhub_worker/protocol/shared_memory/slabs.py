@@ -40,12 +40,7 @@ from gymnasium import spaces
 from envhub_worker.protocol.errors import FAULTS
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.shared_memory.words import *  # noqa: F403 - seen from outside as here
-from envhub_worker.protocol.shared_memory.words import (
-    HEADER_BYTES,
-    INFO_BYTES,
-    LINE,
-    MAX_LEAVES,
-)
+from envhub_worker.protocol.shared_memory.words import HEADER_BYTES, INFO_BYTES, LINE, MAX_LEAVES
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, BOX_DTYPES
 

@@ -269,9 +269,7 @@ def _read_text(reader: SpaceReader, shortest: object, longest: object, character
     most = _integer(longest, 0, MAX_INT64)
     reader.spend(most * ELEMENT_BYTES)  # it is a text of so many characters that is drawn
     return spaces.Text(
-        max_length=most,
-        min_length=_integer(shortest, 0, MAX_INT64),
-        charset=characters,
+        max_length=most, min_length=_integer(shortest, 0, MAX_INT64), charset=characters
     )
 
 

@@ -43,11 +43,7 @@ class HttpPort(ThreadingTCPServer):
     request_queue_size = MAX_CONNECTIONS
 
     def __init__(
-        self,
-        host: str,
-        port: int,
-        answer: Callable[[str], Reply],
-        failed: Callable[[str], None],
+        self, host: str, port: int, answer: Callable[[str], Reply], failed: Callable[[str], None]
     ) -> None:
         self._answer = answer
         self._failed = failed
