@@ -217,4 +217,4 @@ class Failures:
         }
         loaded = lease.loaded
         of_jail = () if loaded is None else (loaded.manifest, loaded.jail.report)
-        lease.repository.keep_crash(error, self._recorder, task, *of_jail, shared=lease.shared)
+        lease.repository.keep_crash(error, self._recorder, task, *of_jail)

@@ -27,7 +27,6 @@ class Crash:
         options: The other arguments that differ from the default ones.
         task: ``suite``, ``task``, ``num_envs``, ``shards``, ``lane``; None before ``make_env`` has
             returned.
-        shared: Whether other environments lived in the same jail.
     """
 
     error: WorkerDiedError | WorkerTimeoutError
@@ -36,23 +35,16 @@ class Crash:
     load: m.Load
     options: dict[str, Any]
     task: dict[str, Any] | None
-    shared: bool
 
 
 class Recorder:
     """Records nothing. Not thread-safe: the environment that owns it holds a lock."""
 
     def started(self) -> None:
-        """A fresh jail."""
-
-    def revived(self) -> None:
-        """Some sub-environments are in a fresh process, others are not."""
+        """A fresh jail, or one in which some sub-environments are in a fresh process."""
 
     def step(self, actions: Any) -> None:
         """A step of all sub-environments, with its validated batch of actions."""
-
-    def skip(self) -> None:
-        """A step or reset of some workers only, which is not recorded."""
 
     def requested(self, request: Request) -> None:
         """Another request, as it was sent."""

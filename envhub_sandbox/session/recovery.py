@@ -172,7 +172,7 @@ class Recovery:
         lifecycle.request = None
         self.fresh = tuple(fresh)
         self._counters.deaths += len(fresh)
-        self._recorder.revived()
+        self._recorder.started()
         lifecycle.moved(Event.REVIVAL)
         merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
         return [reply for reply in merged if reply is not None]

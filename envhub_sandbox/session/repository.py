@@ -338,12 +338,10 @@ class Repository:
         task: dict[str, Any] | None = None,
         manifest: Manifest | None = None,
         report: list[dict[str, Any]] | None = None,
-        *,
-        shared: bool = False,
     ) -> None:
         """Write a crash bundle and name it in the error. What hinders that is only logged.
 
-        ``shared``: whether others lived in its jail. All else is None before there is a jail.
+        All but the error is None before there is a jail.
         """
         ended = getattr(error, "reason", "") in ("killed", "idle", "gone", "connection")
         if ended or not self.policy.crash_history or error.bundle is not None:
@@ -355,7 +353,6 @@ class Repository:
             load=self.arguments,
             options=self.recipe.differing,
             task=task,
-            shared=shared,
         )
         folder = Path(self.policy.crash_folder or cache_root() / "crashes").absolute()
         try:

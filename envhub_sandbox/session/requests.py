@@ -171,8 +171,7 @@ class RequestOrder(ABC):
             self.submit(operation, message_for)
             return self.collect(timeout_s, kind)
 
-    @abstractmethod
-    def note_sent(self, actions: Any | None) -> None:
+    def note_sent(self, actions: Any | None) -> None:  # noqa: B027  # for several workers
         """Workers were sent a step; with these ``actions``, if all of them were."""
 
     @abstractmethod
@@ -267,11 +266,6 @@ class Requests(RequestOrder):
     def came_back(self) -> bool:
         """Whether processes did, under the last request."""
         return self._recovery is not None and bool(self._recovery.fresh)
-
-    def note_sent(self, actions: Any | None) -> None:
-        """Record a step of some workers; ``submit_step`` records a step of all."""
-        if actions is None:
-            self._recorder.skip()
 
     # --- requests ------------------------------------------------------------------------------
 

@@ -19,8 +19,6 @@ from typing import Any
 
 import zmq
 
-from envhub_sandbox.extras.crash import bundle_writer
-from envhub_sandbox.extras.crash.recording import RecordedRequest
 from envhub_sandbox.extras.docker import container
 from envhub_sandbox.extras.judge.play import task, traces
 from envhub_sandbox.extras.packages import environments, interpreters, modules, source
@@ -398,11 +396,6 @@ def forms(spot: Spot) -> dict[Any, Any]:
 def living(ledger: Ledger) -> Any:
     """The environments that a ledger still knows."""
     return ledger._living
-
-
-def packet(frames: Sequence[Buffer]) -> bytes:
-    """A message as a crash bundle keeps it."""
-    return bundle_writer._packet(RecordedRequest([*map(bytes, frames)], exact=True))
 
 
 def monitor_script() -> Path:

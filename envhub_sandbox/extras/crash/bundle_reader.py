@@ -33,7 +33,6 @@ MAX_DOCUMENT_BYTES = 16 << 20
 """``bundle.json``: an empty list takes two bytes there, and forty times as much in memory."""
 _MAX_WISHES = 4000
 """Characters; a longer line is refused, because a shortened one would hide what is granted."""
-_MAX_DOUBTS = 8
 _OF_POLICY = ("profile", "network", "display", "readable", "gpu", "environment", "limits")
 _OF_MAKE_ENV = (
     *("timeouts", "hub_cache_dir", "endpoint", "python", "dependencies", "lock", "assets"),
@@ -57,7 +56,6 @@ class Bundle:
         arguments: The other arguments that differed from the default ones.
         task: ``suite``, ``task``, ``num_envs``, ``shards``, ``lane``; None before ``make_env``
             had returned.
-        doubts: Why the same requests may not have the same effect, one sentence each.
         count, steps: How many requests there are, and how many of them are steps.
     """
 
@@ -69,7 +67,6 @@ class Bundle:
     load: m.Load
     arguments: dict[str, Any]
     task: dict[str, Any] | None
-    doubts: tuple[str, ...]
     packets: bytes
     count: int
     steps: int
@@ -96,17 +93,20 @@ def load_bundle(folder: Path) -> Bundle:
 
 def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
     provenance, packets = _member(document, "provenance", dict), _read(folder, "requests.bin")
-    task, are_steps = document.get("task"), [type(one) is m.Step for one in _messages(packets)]
+    files = _member(provenance, "files", dict)
+    if not all(type(digest) is str for digest in files.values()):
+        raise BundleError("its file hashes are not text")
+    task = document.get("task")
+    are_steps = [isinstance(message, m.Step) for message in _messages(packets)]
     return Bundle(
         label=one_line(_member(document, "label", str), 1000),
         reference=_reference(provenance),
         is_ours=_is_ours(folder.resolve()),
-        files=_texts(_member(provenance, "files", dict)),
+        files=files,
         death=_death(_member(document, "death", dict)),
         load=_load(folder),
         arguments=_member(document, "make_env", dict),
         task=None if task is None else _task(task),
-        doubts=_doubts(_member(document, "doubts", list)),
         packets=packets,
         count=len(are_steps),
         steps=sum(are_steps),
@@ -116,10 +116,6 @@ def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
 def _is_ours(folder: Path) -> bool:
     crashes = (cache_root() / "crashes").resolve()
     return folder.parent == crashes and folders.is_ours_alone(crashes)
-
-
-def _doubts(doubts: list[Any]) -> tuple[str, ...]:
-    return tuple(one_line(str(doubt), 300) for doubt in doubts[:_MAX_DOUBTS])
 
 
 def _reference(provenance: dict[str, Any]) -> str:
@@ -184,15 +180,6 @@ def _member(mapping: dict[str, Any], name: str, kind: type[T]) -> T:
     if type(value) is not kind:
         raise BundleError(f"its {name} is not of type {kind.__name__}")
     return value
-
-
-def _texts(mapping: dict[str, Any]) -> dict[str, str]:
-    if not all(type(value) is str for value in mapping.values()):
-        raise BundleError("its file hashes are not text")
-    return mapping
-
-
-# --- made again ---------------------------------------------------------------------------------
 
 
 def wishes(bundle: Bundle) -> str:

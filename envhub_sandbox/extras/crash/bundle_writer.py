@@ -21,18 +21,19 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
-from envhub_sandbox.extras.crash.recording import RecordedRequest, Recording, encoded
+from envhub_sandbox.extras.crash.history import encoded
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.session.recorder import Crash
 from envhub_sandbox.system import folders
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.stream import pack_packet
 from envhub_worker.protocol.text import printable
 
@@ -46,13 +47,13 @@ _SHORTEST_SECRET = 6
 """Characters: what is shorter is a setting, and would be found everywhere."""
 
 
-def write_bundle(folder: Path, crash: Crash, recording: Recording) -> Path:
-    """Write a bundle; returns its folder.
+def write_bundle(folder: Path, crash: Crash, requests: Sequence[list[bytes]]) -> Path:
+    """Write a bundle of the frames of requests; returns its folder.
     Raises ``OSError``: it cannot be written; nothing is left of it.
     """
     folders.make(folder, folders.PRIVATE_MODE)
     with folders.draft(folder) as building:
-        _write(building, crash, recording)
+        _write(building, crash, requests)
         home = folder / f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{secrets.token_hex(4)}"
         building.rename(home)
     _remove_oldest(folder, home.name)
@@ -76,45 +77,30 @@ def _is_old(path: Path) -> bool:
     return False
 
 
-def _write(folder: Path, crash: Crash, recording: Recording) -> None:
-    load, requests = encoded(crash.load), recording.requests
-    doubts = list(_doubts(crash, recording, load))
+def _write(folder: Path, crash: Crash, requests: Sequence[list[bytes]]) -> None:
+    load = encoded(crash.load)
     content = {
-        "bundle.json": json.dumps(_document(crash, doubts), indent=1, default=str).encode(),
-        "arguments.bin": _packet(load),
-        "requests.bin": b"".join(map(_packet, requests)),
-        "README.txt": _concealed(_in_words(crash, load, doubts, requests), crash).encode(),
+        "bundle.json": json.dumps(_document(crash), indent=1, default=str).encode(),
+        "arguments.bin": packet(load),
+        "requests.bin": b"".join(map(packet, requests)),
+        "README.txt": _concealed(_in_words(crash, load, requests), crash).encode(),
     }
     for name, data in content.items():
         folders.write_private(folder / name, data)
 
 
-def _document(crash: Crash, doubts: list[str]) -> dict[str, Any]:
+def _document(crash: Crash) -> dict[str, Any]:
     denied = crash.error.denied
     return {
         "format": FORMAT,
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "label": crash.label,
         "death": {name: _concealed(text, crash) for name, text in death_of(crash.error).items()},
-        "denied": None if denied is None else [_concealed(one, crash) for one in denied],
+        "denied": None if denied is None else [_concealed(denial, crash) for denial in denied],
         "provenance": crash.provenance,
         "make_env": _plain(crash.options),
         "task": crash.task,
-        "doubts": doubts,
     }
-
-
-def _doubts(crash: Crash, recording: Recording, load: RecordedRequest) -> Iterator[str]:
-    """Why the same requests may not have the same effect."""
-    if not (recording.complete and load.exact):
-        yield (
-            "not everything that was asked is in the bundle: it was too much, or lost in a "
-            "restart, or only pickle could carry it"
-        )
-    if crash.task is not None and not recording.seeded:
-        yield "no reset had seeded every sub-environment, so chance may decide otherwise"
-    if crash.shared:
-        yield "other environments were in the same process; their requests are not recorded"
 
 
 def _concealed(value: Any, crash: Crash) -> Any:
@@ -126,26 +112,25 @@ def _concealed(value: Any, crash: Crash) -> Any:
 
 
 def _secrets(policy: Any) -> list[tuple[str, str]]:
-    """What is looked for, as it is printed, with the name of its variable.
-
-    Lines of a value too: a printed one has a margin before each. The longest first, which may
-    begin with another.
+    """Each value as it may be printed, and the name of its variable; a longer one may contain
+    others, so it comes first. Lines of a value count, too: a margin is printed before each.
     """
-    found: dict[str, str] = {}
+    names: dict[str, str] = {}
     for name in (policy or {}).get("environment", ()):
         value = os.environ.get(name, "")
         for text in (value, *map(str.strip, value.splitlines())):
             if len(text) >= _SHORTEST_SECRET:
-                found |= {text: name, printable(text, len(text)): name}
-    return sorted(found.items(), key=lambda one: len(one[0]), reverse=True)
+                names |= {text: name, printable(text, len(text)): name}
+    return [(text, names[text]) for text in sorted(names, key=len, reverse=True)]
 
 
-def _text(request: RecordedRequest) -> str:
-    return one_line(repr(m.unpack(request.frames)), 400)
+def _text(frames: list[bytes]) -> str:
+    return one_line(repr(m.unpack(frames)), 400)
 
 
-def _packet(request: RecordedRequest) -> bytes:
-    return b"".join(map(bytes, pack_packet(1, request.frames)))
+def packet(frames: Sequence[Buffer]) -> bytes:
+    """A message as a bundle keeps it."""
+    return b"".join(map(bytes, pack_packet(1, frames)))
 
 
 def death_of(error: WorkerDiedError | WorkerTimeoutError) -> dict[str, Any]:
@@ -172,20 +157,15 @@ def _plain(value: Any) -> Any:
     return os.fspath(value) if isinstance(value, os.PathLike) else type(value).__name__
 
 
-def _in_words(
-    crash: Crash, load: RecordedRequest, doubts: list[str], requests: list[RecordedRequest]
-) -> str:
-    task, denied = crash.task, crash.error.denied or ()
-    where = [] if task is None else [f"Environment: {one_line(repr(task), 400)}"]
+def _in_words(crash: Crash, load: list[bytes], requests: Sequence[list[bytes]]) -> str:
     first, last = requests[:-_SHOWN_REQUESTS][:1], requests[-_SHOWN_REQUESTS:]
     lines = [
         f"A worker process of {crash.label} died.\n",
         f"{printable(str(crash.error))}\n",
         "To do the same again:  envhub replay <this folder>\n",
         f"Arguments: {_text(load)}",
-        *where,
-        *(f"Not exact: {doubt}" for doubt in doubts),
-        *(f"Denied: {printable(one)}" for one in denied),
+        *([] if crash.task is None else [f"Environment: {one_line(repr(crash.task), 400)}"]),
+        *(f"Denied: {printable(denial)}" for denial in crash.error.denied or ()),
         f"\nThe first and the last of {len(requests)} requests, the last one unanswered:",
         *(f"  {_text(request)}" for request in (*first, *last)),
     ]

@@ -67,8 +67,6 @@ def replay(
             "the bundle may be a stranger's. If you trust its source, add --grant: a replay uses "
             f"{bundle_reader.wishes(loaded)}"
         )
-    for doubt in loaded.doubts:
-        show("not exact", doubt, "yellow", stderr=True)
     if (died_in := loaded.arguments.get("sandbox", "process")) != sandbox:
         show("sandbox", f"it died in {died_in}; this is {sandbox}", "yellow", stderr=True)
     options = bundle_reader.replayed_arguments(loaded) | {**given, "sandbox": sandbox}
@@ -136,7 +134,6 @@ def _document(
         "label": bundle.label,
         "verdict": replayed.verdict.value,
         "changed_files": [safe_line(path) for path in changed],
-        "doubts": list(bundle.doubts),
         "recorded": {"requests": bundle.count, **bundle.death},
         "replayed": {
             "requests": replayed.requests,

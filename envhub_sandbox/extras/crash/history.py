@@ -8,14 +8,14 @@ caller may change what they were made of afterwards.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
-from itertools import chain
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from envhub_sandbox.extras.crash.recording import RecordedRequest, Recording, encoded
+from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.recorder import Crash, Recorder
 from envhub_worker.protocol import messages as m
 
@@ -31,97 +31,74 @@ _MOST_LASTING = 256
 _LASTING = (m.Call, m.SetAttr, m.CallOwn, m.CallOne)
 _PASSING = frozenset({"reset", "step", "render"})
 """What is over with the next seed, also where one sub-environment does it alone."""
-_SLICED = (m.Reset, m.SetAttr, m.SetRandom, m.GetOne, m.CallOne)
-"""Each shard is sent another part of these."""
+_SLICED: dict[type[m.Message], tuple[str, ...]] = {
+    m.Reset: ("seeds", "mask"),
+    m.SetAttr: ("values",),
+    m.SetRandom: ("states",),
+    m.GetOne: (),
+    m.CallOne: (),
+}
+"""The messages of which each shard is sent another part, and the fields that are joined again."""
+
+
+class RecordedRequest(NamedTuple):
+    """A request as it is kept: frames without anything pickled; ``lasts``: beyond a reset."""
+
+    frames: list[bytes]
+    lasts: bool = False
 
 
 class History(Recorder):
-    """Records the last requests of one environment.
-
-    ``complete`` and ``seeded`` are as in ``Recording``.
-    """
+    """Records the last requests of one environment."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
-        self._log: deque[Any] = deque()  # of steps the actions
+        # A step of plain actions is kept as the array: packing takes longer than many a step.
+        self._log: deque[NDArray[Any] | RecordedRequest] = deque()
         self.started()
 
     def started(self) -> None:
         """See ``Recorder``: requests to the former jail are forgotten."""
-        self.complete = True
-        self._begin(())
-
-    def revived(self) -> None:
-        """See ``Recorder``: a replay is not exact, as only some processes had earlier requests."""
-        self.complete = self.complete and not self._log
         self._begin(())
 
     def _begin(self, entries: Sequence[RecordedRequest]) -> None:
-        self.seeded = False
         self._log.clear()
-        self._log.extend(entries)
-        self._room = HISTORY_BYTES - sum(map(_size, entries))
+        self._room = HISTORY_BYTES
+        for entry in entries:
+            self._add(entry)
 
     def step(self, actions: Any) -> None:
         """See ``Recorder``."""
-        if type(actions) is not np.ndarray:
-            self._add(_copied(actions))
-            return
-        self._log.append(actions.copy())
-        self._room -= actions.nbytes + _ENTRY_BYTES
-        if self._room < 0 or len(self._log) > self._limit:
-            self._evict()
-
-    def skip(self) -> None:
-        """See ``Recorder``."""
-        self.complete = False
+        plain = type(actions) is np.ndarray and not actions.dtype.hasobject
+        self._add(actions.copy() if plain else RecordedRequest(encoded(m.Step(0, actions))))
 
     def requested(self, request: Request) -> None:
-        """See ``Recorder``."""
-        message = request.messages[0]
-        if isinstance(message, m.Reset) and message.mask is None:
-            self._reset([one.seeds for one in request.messages if isinstance(one, m.Reset)])
-        passes = isinstance(message, m.CallOne) and message.name in _PASSING
-        packed = _packed(request)._replace(lasts=isinstance(message, _LASTING) and not passes)
-        self._add(packed)
-
-    def _reset(self, seeds: list[Any]) -> None:
-        """A reset of all: what it seeds does not depend on anything before, but for what lasts.
-
-        Where none was seeded, nobody knows what came before it either.
+        """See ``Recorder``. What a reset of all seeds does not depend on what was asked before it,
+        but for calls and attributes, which are asked again first, equal ones once.
         """
-        each = chain.from_iterable(some if isinstance(some, list) else [some] for some in seeds)
-        seeding = all(seed is not None for seed in each)
-        if seeding or not self.seeded:
+        message = request.messages[0]
+        if isinstance(message, m.Reset) and message.mask is None and _seeds_all(request.messages):
             lasting = {
                 tuple(entry.frames): entry
                 for entry in reversed(self._log)
                 if isinstance(entry, RecordedRequest) and entry.lasts
             }
-            self.complete = self.complete and len(lasting) <= _MOST_LASTING
             self._begin([*lasting.values()][_MOST_LASTING - 1 :: -1])
-            self.seeded = seeding
+        passes = isinstance(message, m.CallOne) and message.name in _PASSING
+        self._add(RecordedRequest(_frames(request), isinstance(message, _LASTING) and not passes))
 
-    def _add(self, entry: Any) -> None:
+    def _add(self, entry: NDArray[Any] | RecordedRequest) -> None:
         self._log.append(entry)
         self._room -= _size(entry)
-        if self._room < 0 or len(self._log) > self._limit:
-            self._evict()
-
-    def _evict(self) -> None:
-        """Forget the oldest requests."""
         while self._log and (self._room < 0 or len(self._log) > self._limit):
             self._room += _size(self._log.popleft())
-            self.complete = False
 
-    def recording(self) -> Recording:
-        """What is kept, as it stands."""
-        requests = [
-            entry if isinstance(entry, RecordedRequest) else encoded(m.Step(0, entry))
+    def recording(self) -> list[list[bytes]]:
+        """The frames of what is kept, in order."""
+        return [
+            entry.frames if isinstance(entry, RecordedRequest) else encoded(m.Step(0, entry))
             for entry in self._log
         ]
-        complete = self.complete and all(request.exact for request in requests)
-        return Recording(requests, complete, self.seeded)
 
     def of_part(self) -> Recorder:
         """See ``Recorder``."""
@@ -144,67 +121,53 @@ class _PartHistory(Recorder):
     def __init__(self, whole: History) -> None:
         self.requested = whole.requested  # type: ignore[method-assign]  # for this worker alone
         self.write = whole.write  # type: ignore[method-assign]
-        # this worker is fresh, and the others may not be
-        self.started = self.revived = whole.revived  # type: ignore[method-assign]
+        self.started = whole.started  # type: ignore[method-assign]
 
 
-def _packed(request: Request) -> RecordedRequest:
+def encoded(message: m.Message) -> list[bytes]:
+    """A message as it can be kept, with descriptions in place of what only pickle could carry."""
+    try:
+        return [*map(bytes, m.pack(message))]
+    except EnvHubError:
+        return [*map(bytes, m.pack(m.Done()))]
+
+
+def _seeds_all(resets: Sequence[Any]) -> bool:
+    seeds = [reset.seeds if isinstance(reset.seeds, list) else [reset.seeds] for reset in resets]
+    return all(seed is not None for each in seeds for seed in each)
+
+
+def _frames(request: Request) -> list[bytes]:
     """What is kept of a request: what one shard was sent, where that is all of it."""
     first = request.messages[0]
     all_of_it = len(request.messages) == 1 and request.bounds[0][0] == 0
-    is_whole = all_of_it or not isinstance(first, _SLICED)
-    if request.plain and is_whole:
-        return RecordedRequest(request.kept()[0], exact=True)
+    if request.plain and (all_of_it or type(first) not in _SLICED):
+        return request.kept()[0]
     return encoded(_whole(request.messages, request.bounds))
 
 
-def _whole(messages: Sequence[m.Message], bounds: Sequence[tuple[int, int]]) -> m.Message:
+def _whole(messages: Sequence[Any], bounds: Sequence[tuple[int, int]]) -> m.Message:
     """One message of those for all shards, to no environment in particular."""
-    first: Any = messages[0]
+    first = messages[0]
     changes: dict[str, Any] = {"env": 0}
-    others: Sequence[Any] = messages
-    if isinstance(first, m.Reset):
-        if isinstance(first.seeds, list):
-            changes["seeds"] = [seed for one in others for seed in one.seeds]
-        if first.mask is not None:
-            changes["mask"] = np.concatenate([one.mask for one in others])
-    if isinstance(first, m.SetAttr):
-        changes["values"] = tuple(value for one in others for value in one.values)
-    if isinstance(first, m.SetRandom):
-        changes["states"] = tuple(state for one in others for state in one.states)
+    for name in _SLICED.get(type(first), ()):
+        changes[name] = _joined([getattr(message, name) for message in messages])
     if isinstance(first, (m.GetOne, m.CallOne)):
-        places = [
-            start + one.index
-            for (start, _), one in zip(bounds, others, strict=True)
-            if one.index is not None
-        ]
-        changes["index"] = places[0] if places else None
-    made: m.Message = m.replace(first, **changes)
-    return made
+        asked = zip(bounds, messages, strict=True)
+        rows = [start + part.index for (start, _), part in asked if part.index is not None]
+        changes["index"] = rows[0] if rows else None
+    whole: m.Message = m.replace(first, **changes)
+    return whole
 
 
-def _copied(value: Any) -> Any:
-    """Actions that their owner cannot change any more: arrays copied, containers rebuilt."""
-    if type(value) is np.ndarray:
-        return value.copy()
-    if type(value) is dict or isinstance(value, Mapping):
-        return {key: _copied(item) for key, item in value.items()}
-    if isinstance(value, tuple) and hasattr(value, "_fields"):
-        return type(value)(*map(_copied, value))
-    if type(value) is list:
-        return list(map(_copied, value))
-    if isinstance(value, (tuple, list)):
-        return tuple(map(_copied, value))
-    return value
+def _joined(slices: Sequence[Any]) -> Any:
+    if isinstance(slices[0], np.ndarray):
+        return np.concatenate(slices)
+    is_sequence = isinstance(slices[0], (list, tuple))
+    return type(slices[0])(item for part in slices for item in part) if is_sequence else slices[0]
 
 
-def _size(value: Any) -> int:
-    if isinstance(value, RecordedRequest):
-        return _REQUEST_BYTES + sum(map(len, value.frames))
-    if type(value) is np.ndarray:
-        return value.nbytes + _ENTRY_BYTES
-    if type(value) is dict or isinstance(value, Mapping):
-        return sum(map(_size, value.values())) + _ENTRY_BYTES
-    if isinstance(value, (tuple, list)):
-        return sum(map(_size, value)) + _ENTRY_BYTES
-    return len(value) if isinstance(value, (str, bytes)) else _ENTRY_BYTES
+def _size(entry: NDArray[Any] | RecordedRequest) -> int:
+    if isinstance(entry, RecordedRequest):
+        return _REQUEST_BYTES + sum(map(len, entry.frames))
+    return entry.nbytes + _ENTRY_BYTES

@@ -224,9 +224,7 @@ class FleetRequests(RequestOrder):
     def note_sent(self, actions: Any | None) -> None:
         """See ``RequestOrder``."""
         self._counters.requests += 1
-        if actions is None:
-            self._recorder.skip()
-        else:
+        if actions is not None:
             self._recorder.step(actions)
 
     def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:

@@ -108,4 +108,4 @@ def test_a_config_and_a_task_are_found_again(tmp_path: Path) -> None:
     done = envhub("replay", str(caught.value.bundle), "--grant", "--json")
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
-    assert (document["doubts"], document["replayed"]["steps"]) == ([], 5)
+    assert document["replayed"]["steps"] == 5

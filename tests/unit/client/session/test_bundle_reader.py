@@ -28,7 +28,6 @@ from envhub_sandbox.extras.crash.history import History
 from envhub_sandbox.extras.crash.replay import Verdict, replay
 from envhub_sandbox.session.recorder import Crash
 from envhub_worker.protocol import messages as m
-from tests.support import inside
 from tests.support.wire import requested
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -53,7 +52,6 @@ def bundle(folder: Path, **options: Any) -> Path:
         load=m.Load(2, False, None, {"size": np.arange(3)}),
         options=options,
         task={"suite": "s", "task": 0, "num_envs": 2, "shards": 1, "lane": "frames"},
-        shared=False,
     )
     return bundle_writer.write_bundle(folder, crash, history.recording())
 
@@ -72,7 +70,6 @@ def edit(folder: Path, *path: Any, value: Any) -> None:
 def test_a_bundle_comes_back(tmp_path: Path) -> None:
     found = load_bundle(bundle(tmp_path))
     assert found.reference == f"models/org/repo@{COMMIT}"
-    assert found.doubts == ()
     assert found.steps == 3
     assert [type(one).__name__ for one in found.requests()] == ["Reset", "Step", "Step", "Step"]
     assert found.load.env_kwargs["size"].tolist() == [0, 1, 2]  # type: ignore[attr-defined]
@@ -100,7 +97,6 @@ def test_a_bundle_comes_back(tmp_path: Path) -> None:
         (("label",), 5),
         (("task", "num_envs"), "2"),
         (("make_env",), []),
-        (("doubts",), "none"),
     ],
 )
 def test_a_broken_index_is_refused(tmp_path: Path, path: tuple[Any, ...], value: Any) -> None:
@@ -165,7 +161,7 @@ def test_nothing_in_a_bundle_is_executed(tmp_path: Path) -> None:
     folder = bundle(tmp_path)
     load = m.Load(1, False, None, {"a": Bomb(canary)})
     frames = m.pack(load, pickler=pickle.dumps)
-    (folder / "arguments.bin").write_bytes(inside.packet(frames))
+    (folder / "arguments.bin").write_bytes(bundle_writer.packet(frames))
     with pytest.raises(BundleError, match="cannot be read as a crash bundle"):
         load_bundle(folder)
     assert not canary.exists()
@@ -179,7 +175,7 @@ def test_requests_are_not_decoded_all_at_once(name: str, tmp_path: Path) -> None
     folder, most = bundle(tmp_path), 10
     lists: list[list[int]] = [[] for _ in range(5_000)]
     frames = m.pack(m.Load(1, False, None, {"a": lists}))
-    (folder / name).write_bytes(inside.packet(frames) * most)
+    (folder / name).write_bytes(bundle_writer.packet(frames) * most)
     one = sum(map(sys.getsizeof, [lists, *lists]))
     tracemalloc.start()
     try:
@@ -293,7 +289,7 @@ def test_a_bundle_cannot_call_the_proxy_itself(tmp_path: Path) -> None:
         m.CallOne(0, 1, 0, "__setattr__", ("asked", []), {}),
         m.Close(0),
     ]
-    packets = b"".join(inside.packet(m.pack(call)) for call in calls)
+    packets = b"".join(bundle_writer.packet(m.pack(call)) for call in calls)
     (folder / "requests.bin").write_bytes(packets)
     env = Recorder()
     asked = env.asked
@@ -319,7 +315,7 @@ def test_a_request_that_does_not_fit_is_said(tmp_path: Path) -> None:
     found = replay(lambda: env, load_bundle(folder))
     assert found.verdict is Verdict.DIFFERENT
     assert "request 2 does not fit" in found.note
-    setting = inside.packet(m.pack(m.SetAttr(0, "size", (1,))))
+    setting = bundle_writer.packet(m.pack(m.SetAttr(0, "size", (1,))))
     (folder / "requests.bin").write_bytes(setting + (folder / "requests.bin").read_bytes())
     for error in (ValueError("one value each"), TypeError("no"), ActionError("no")):
         env.set_attr = Mock(side_effect=error)

@@ -42,7 +42,7 @@ def render(number: int, bounds: tuple[int, int]) -> m.Message:
 
 def recorded(session: EnvSession) -> list[m.Message]:
     assert isinstance(session.recorder, History)
-    return [m.unpack(request.frames) for request in session.recorder.recording().requests]
+    return [*map(m.unpack, session.recorder.recording())]
 
 
 def test_a_request_is_sent_counted_and_kept(session: EnvSession, lane: FakeLane) -> None:
