@@ -1,7 +1,5 @@
 """What holds for every test: a cache of its own, and the plugins that all of them run with."""
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

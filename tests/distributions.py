@@ -5,8 +5,6 @@ into an empty environment, where the README's first command has to play from wha
 alone. Needs the way to an index.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

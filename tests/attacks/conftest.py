@@ -4,8 +4,6 @@
 table; run it as root and as a plain user for all of them.
 """
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 ``docs/threat-model.md`` lists every one of them; a test compares the two.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 MEASURED = "memory measured by init"

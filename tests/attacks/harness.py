@@ -6,8 +6,6 @@ file, a victim, the process table, or (where something is to be stolen) for a ra
 came back through the channels that the repository has anyway.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Repositories of one environment, which differs from a plain one in what its test needs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from tests.support.repositories import write_repository

@@ -4,8 +4,6 @@ A run knows one user's columns; those of the other one are taken over from the p
 ``python -m tests.attacks.table attacks.md`` writes the summary of such a page, ``docs/attacks.md``.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """What is said about the attacks is what is tested."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """How the suite reaches the environments that it checks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """An environment and its reference, driven by the same seeds and actions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Sub-environments over several workers, each in a jail of its own: what one place gives."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ Written anew after ``tests/vector`` of its repository. Each test runs on ``SyncV
 process, so that it says what is so there, and on each way to have the same in a sandbox.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """What the caller hands in reaches the environment as it would in this process."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ Except where sub-environments disagree about a key's dtype: Gymnasium casts to t
 each shard has a first one of its own.
 """
 
-from __future__ import annotations
-
 import itertools
 import warnings
 from typing import Any

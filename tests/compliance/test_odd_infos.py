@@ -1,7 +1,5 @@
 """Infos that the wire has no form for lose nothing but themselves, in one process and several."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 from typing import Any

@@ -3,8 +3,6 @@
 The oracle is a plain process that has the same packages, and uses ``gym`` as its users did.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import warnings

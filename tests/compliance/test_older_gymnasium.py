@@ -4,8 +4,6 @@ The oracle is the client's own Gymnasium, in the mode that the older release had
 on 0.29 gives is what the same repository would give here with ``SAME_STEP``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Repositories' own vector environments, wrapped ones, and old or odd results and errors."""
 
-from __future__ import annotations
-
 import builtins
 from pathlib import Path
 from typing import Any

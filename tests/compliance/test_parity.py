@@ -1,7 +1,5 @@
 """The samples that have a ``SyncVectorEnv`` to be compared with, against the suite."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from gymnasium.error import CustomSpaceError

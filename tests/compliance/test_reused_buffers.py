@@ -5,8 +5,6 @@ infos when it has them, and refers to a ``final_obs``; and the end of a single e
 is the end.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 from copy import deepcopy

@@ -1,7 +1,5 @@
 """Seeded spaces draw the same here and there; what nobody seeded starts anywhere, in each run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """``send`` and ``recv`` give each sub-environment what it gives alone, whatever others do."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """One sub-environment at a time, and what is told of it: as in ``SyncVectorEnv``, in every way."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any

@@ -1,7 +1,5 @@
 """What a sub-environment warns of reaches the caller as it does from ``SyncVectorEnv``."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Iterator

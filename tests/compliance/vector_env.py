@@ -4,8 +4,6 @@ Inherit from ``VectorEnvCompliance``, name a sample repository and its cases, an
 on each of them. ``SyncVectorEnv`` in this process is the oracle, for ``use_async_envs`` too.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 from collections.abc import Iterator

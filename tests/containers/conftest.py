@@ -5,8 +5,6 @@ checkout: ``docker build -t envhub-worker .``. With
 ``ENVHUB_CONTAINER_TABLE=docs/attacks-containers.md`` a run as root writes the table of attacks.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile

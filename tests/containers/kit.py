@@ -1,7 +1,5 @@
 """Looking at containers from outside."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -4,8 +4,6 @@ In a jail with namespaces, in a jail without, and in no jail at all, next to the
 one shows what the container's own walls hold.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import socket

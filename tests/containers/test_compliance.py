@@ -1,7 +1,5 @@
 """An environment in a container is the same as the one in process, over both lanes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """A repository's packages, made here and mounted into its container."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

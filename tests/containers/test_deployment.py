@@ -1,7 +1,5 @@
 """The lines and files of ``examples/deployment``, run as they are written."""
 
-from __future__ import annotations
-
 import os
 import re
 import secrets

@@ -1,7 +1,5 @@
 """The blocks of ``docs/deployment.md`` about containers on this machine do what they say."""
 
-from __future__ import annotations
-
 import secrets
 import shlex
 import shutil

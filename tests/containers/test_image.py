@@ -1,7 +1,5 @@
 """The image, and those that ``envhub image build`` derives from it for a repository."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re

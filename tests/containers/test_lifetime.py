@@ -1,7 +1,5 @@
 """However a client or a container ends, nothing of it remains; and nobody else's is touched."""
 
-from __future__ import annotations
-
 import collections
 import contextlib
 import json

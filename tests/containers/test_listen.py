@@ -1,7 +1,5 @@
 """``docker run envhub-worker``: a server for clients outside, over TCP with keys."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """A container that is reached by a port on loopback, as on macOS and Windows."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

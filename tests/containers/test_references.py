@@ -1,7 +1,5 @@
 """In a container, too: assets, and environments that a package registers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What cannot be had is refused, with the command that helps; nothing is quietly weaker."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What an entry of the corpus is, and the repository that is written of it."""
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field

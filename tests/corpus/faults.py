@@ -5,8 +5,6 @@ and LeRobot (Gymnasium 899, 914, 1084, 1179, 1207, 1445; gym 980, 1420; Stable-B
 1151; gym-pusht 27; RLBench 48; ManiSkill 320).
 """
 
-from __future__ import annotations
-
 import io
 import py_compile
 import re

@@ -1,7 +1,5 @@
 """Repositories in which nothing is wrong, each in a style of its own."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from tests.corpus.entries import Entry

@@ -4,8 +4,6 @@ What stands with an entry is in the table of ``docs/checks.md``; here each third
 judged, and of the faults that one check finds the first. ``ENVHUB_TEST_LONG=1`` judges all.
 """
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """One worker server for all cells in a row, with a neighbour in it that must go on."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

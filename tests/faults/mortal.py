@@ -1,7 +1,5 @@
 """The sample that dies as its actions say, and what it does where it may not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

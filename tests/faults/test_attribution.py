@@ -5,8 +5,6 @@ closes. Every request carries a token of its own and every answer repeats it; bu
 what has died and comes back, under ``restart="transparent"``, which say so.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal

@@ -1,7 +1,5 @@
 """Crash bundles: what is in them, and that the same requests bring about the same death."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import stat

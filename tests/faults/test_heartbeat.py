@@ -1,7 +1,5 @@
 """A timeout says whether the worker computes, waits or is stopped."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

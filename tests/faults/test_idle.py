@@ -1,7 +1,5 @@
 """``Timeouts(idle_s)``: what nobody uses gives its memory back, and comes back with a reset."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

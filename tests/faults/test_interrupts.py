@@ -1,7 +1,5 @@
 """Ctrl-C or ``close`` at the worst moment: all is given back, and the error says what happened."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The counters say what has happened, and so does what Prometheus reads, by its own parser."""
 
-from __future__ import annotations
-
 import gc
 from pathlib import Path
 from typing import Any

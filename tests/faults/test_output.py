@@ -1,7 +1,5 @@
 """What a worker prints reaches a file or a log, whatever becomes of the worker."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

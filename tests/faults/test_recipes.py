@@ -1,7 +1,5 @@
 """A proxy in a pickle is a recipe: the other process gets an environment and worker of its own."""
 
-from __future__ import annotations
-
 import multiprocessing
 import pickle
 from types import SimpleNamespace

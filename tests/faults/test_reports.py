@@ -1,7 +1,5 @@
 """What confines an environment is its own jail's to say, for as long as it lives in one."""
 
-from __future__ import annotations
-
 import pytest
 
 from envhub_sandbox import errors, make_env

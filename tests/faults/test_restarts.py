@@ -1,7 +1,5 @@
 """How often, and how soon, a worker that died is replaced."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """``restart="transparent"``: what died comes back reset and says so; the others go on."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

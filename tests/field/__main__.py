@@ -7,8 +7,6 @@ line each says how that went and which calls the jail was denied; the end says w
 permitted calls none of them has made. What no jail permits is marked ``refused``, with why.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -11,8 +11,6 @@ is printed at the end: for each target how many lies were taken, refused, or cou
 slowest, and the most memory. The exit code is 1 if anything came out that must not.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

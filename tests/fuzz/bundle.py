@@ -1,7 +1,5 @@
 """Crash bundles that a stranger has made: read, asked what they want, and repeated on a dummy."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The process that is lied to: little memory, a watchdog, and a note of what it is being told."""
 
-from __future__ import annotations
-
 import gc
 import json
 import mmap

@@ -1,7 +1,5 @@
 """Targets that do what none must: whoever runs the others has to notice. Run only by name."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Callable

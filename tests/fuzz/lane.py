@@ -1,7 +1,5 @@
 """The fast lane's slabs with anything in them: the jail writes what and when it likes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Spoiled values, documents and bytes; everything comes from one seeded generator."""
 
-from __future__ import annotations
-
 import random
 import struct
 from typing import Any

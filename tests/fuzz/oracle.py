@@ -1,7 +1,5 @@
 """What may come of a lie, said without the code that is being lied to."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import re

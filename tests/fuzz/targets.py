@@ -4,8 +4,6 @@ It raises ``WrongError`` where a lie did harm; errors of this project are refusa
 else is what must never come out.
 """
 
-from __future__ import annotations
-
 import random
 import re
 from collections.abc import Callable

@@ -4,8 +4,6 @@
 another outline, as a list of frames.
 """
 
-from __future__ import annotations
-
 import pickle
 import sys
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Fixtures for tests that need a Hub; loaded by tests/conftest.py."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

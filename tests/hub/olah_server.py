@@ -5,8 +5,6 @@ LFS. It answers everything that it does not find with 401 RepoNotFound; errors o
 are ``stub_hub``'s part.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 import socket

@@ -4,8 +4,6 @@
 takes longer than what it shows: they are left out.
 """
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The bundled examples run as their first lines say."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

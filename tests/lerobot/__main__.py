@@ -7,8 +7,6 @@ own for each version, with what that version asks for, and the plugin distributi
 its folder. A torch without CUDA is taken from ``$PIP_FIND_LINKS``.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """LeRobot's evaluation is the same in the sandbox: run by ``python -m tests.lerobot`` only."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

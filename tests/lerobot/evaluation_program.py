@@ -3,8 +3,6 @@
 To be run in an interpreter that has all of LeRobot, by ``kit.run``.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

@@ -1,7 +1,5 @@
 """Runs a program in an interpreter that has LeRobot, and reads what it found."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex

@@ -3,8 +3,6 @@
 To be run in an interpreter that has LeRobot, by ``kit.run``.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

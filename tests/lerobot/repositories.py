@@ -1,7 +1,5 @@
 """Repositories in the shapes that LeRobot's pages show, each served by the Hub on loopback."""
 
-from __future__ import annotations
-
 from tests.hub.olah_server import OlahServer
 
 REACH = '''

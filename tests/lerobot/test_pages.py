@@ -1,7 +1,5 @@
 """Every way in which LeRobot's pages use the Hub works with its own ``make_env``, installed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

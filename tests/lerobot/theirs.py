@@ -3,8 +3,6 @@
 They lie in its repository and in no wheel, so that they run where ``--source`` names a clone of it.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """LeRobot's training, evaluated in the sandbox, is the same: by ``python -m tests.lerobot``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

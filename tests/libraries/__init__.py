@@ -6,8 +6,6 @@ same environment without a sandbox and with it, and fails unless the results are
 without CUDA is taken from ``$PIP_FIND_LINKS``.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """A repository that is played here and in the sandbox, and what a library makes of both."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Packages of environments: what each registers, in Gymnasium's own vector environment."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from compared import ENV, folder, report

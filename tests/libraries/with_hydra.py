@@ -1,7 +1,5 @@
 """Options of ``make_env`` from a configuration of Hydra's, whose lists are ``ListConfig``."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """PufferLib's emulation of an environment, and its serial vector of such."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

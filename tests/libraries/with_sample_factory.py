@@ -1,7 +1,5 @@
 """Sample Factory's batched environment, as its samplers make it of a registered one."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

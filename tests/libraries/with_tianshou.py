@@ -1,7 +1,5 @@
 """Tianshou's own vectors of single environments, and its collector on them."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """SuperSuit's wrappers, skrl's wrapper of vector environments, and d3rlpy's online training."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import d3rlpy

@@ -1,7 +1,5 @@
 """Servers for tests that leave them as they were."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A second host on this one: a network namespace of its own, and a cable to it."""
 
-from __future__ import annotations
-
 import os
 import secrets
 import shutil

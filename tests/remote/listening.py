@@ -1,7 +1,5 @@
 """A listening worker server of our own, and what it said."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import io

@@ -1,7 +1,5 @@
 """A socket with the keys of a client, which says what it likes."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """A wire between client and server that can be slow, be cut, and be listened in on."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading

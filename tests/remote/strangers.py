@@ -1,7 +1,5 @@
 """Connections without ZeroMQ, which say what they like."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 

@@ -1,7 +1,5 @@
 """Whatever a client asks, it is answered, and others go on: also what breaks every rule."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Assets on another host: sent as the repository's own files are, and shown there read-only."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Clients with a key who keep no other rule: other clients, and the server's machine, are safe."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Deaths, what was printed before them, and idleness on another host: as here."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Packages that a server on another host installs, where its operator permits that."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

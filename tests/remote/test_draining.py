@@ -1,7 +1,5 @@
 """A server that is told to end lets nothing new in, lets what runs end, and loses no client."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import threading

@@ -1,7 +1,5 @@
 """Two hosts for real: delay, loss, a cable that is out, and what comes back after it."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """Large frames travel compressed where both sides can, and bombs do not go off."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

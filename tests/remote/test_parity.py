@@ -1,7 +1,5 @@
 """The compliance suite against a server over TCP, with keys: the same, bit for bit."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """Snapshots that clients bring along: only missing files, verified, bounded, nobody else's."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """Client and worker of different versions of the protocol refuse one another, and say why."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

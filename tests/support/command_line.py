@@ -1,7 +1,5 @@
 """The command line ``envhub``, here or in a process of its own, and the processes below it."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Bit-for-bit comparison of what two environments returned."""
 
-from __future__ import annotations
-
 import enum
 import math
 import struct

@@ -1,7 +1,5 @@
 """Runs Python source in a runner of a real jail, and the same source without one as the control."""
 
-from __future__ import annotations
-
 import json
 import os
 import select

@@ -1,7 +1,5 @@
 """The value that frames hold, as ``codec.encoder.encode`` made them; a message has one, too."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler

@@ -7,8 +7,6 @@ here is added here: a function, or a *spot*, which is an owner and a name, for
 ``monkeypatch.setattr(*inside.ending(env), interrupted)``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence

@@ -4,8 +4,6 @@ Root's jails run as another user. With a private root they are shown the interpr
 that user needs the host's permission to read it, which one below ``/root`` does not give.
 """
 
-from __future__ import annotations
-
 import os
 import stat
 import sys

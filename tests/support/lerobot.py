@@ -4,8 +4,6 @@ Followed, call by call: ``lerobot.scripts.lerobot_eval`` (``rollout``, ``eval_po
 ``eval_policy_all``), ``lerobot.envs.utils`` (``check_env_attributes_and_types``, ``close_envs``).
 """
 
-from __future__ import annotations
-
 import concurrent.futures
 import threading
 from collections.abc import Callable, Mapping

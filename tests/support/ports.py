@@ -1,7 +1,5 @@
 """Ports of loopback: those for programs that bind them themselves, and small HTTP servers."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 import socket

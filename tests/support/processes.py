@@ -1,7 +1,5 @@
 """What runs below this process, and what is left of it."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

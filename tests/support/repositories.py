@@ -1,7 +1,5 @@
 """Repositories too small to be kept as folders."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 CARTPOLES = """

@@ -4,8 +4,6 @@ Importing them here is allowed: they are ours. The environments that come out ar
 in-process user of Gymnasium would have, and so the oracle for the sandbox.
 """
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import sys

@@ -1,7 +1,5 @@
 """An environment that is made, reset and in the end closed: what most tests begin with."""
 
-from __future__ import annotations
-
 import gc
 import os
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """What lies in a folder, as it can be seen from outside: to say that it stayed as it was."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import stat

@@ -1,7 +1,5 @@
 """Turns: what concerns the whole machine is done by one test at a time, whichever run it is of."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 from collections.abc import Iterator

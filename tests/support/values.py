@@ -1,7 +1,5 @@
 """Values of every kind that the wire carries, nested in any way."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

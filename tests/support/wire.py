@@ -1,7 +1,5 @@
 """Hand-made messages, for tests of what a hostile or older peer may send."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 from unittest.mock import Mock

@@ -1,7 +1,5 @@
 """A liar, and a repository that nobody ever reads."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What tests of a lying worker share: how to open its environment, to lie, and to be refused."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from collections.abc import Callable, Iterator

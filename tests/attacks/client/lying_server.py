@@ -5,8 +5,6 @@ has a lie for. Runs in a thread of the test: what it allocates is small, so that
 client is made to take shows.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

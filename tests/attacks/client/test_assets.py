@@ -4,8 +4,6 @@ A control follows the card as a loader without judgement would, with YAML's and 
 own functions. Judged at the Hub, which writes down who asked for what, and by what a jail can read.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A worker that lies about what it watches: about values that are kept, and about changes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

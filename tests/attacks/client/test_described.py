@@ -4,8 +4,6 @@ The controls make of the same fields what they ask for: there memory is asked fo
 command runs, and what one message may cost is not what its parts cost one by one.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

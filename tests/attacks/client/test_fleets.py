@@ -4,8 +4,6 @@ It may end what it serves, which costs the caller an error. The rows of the othe
 and their workers go on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any

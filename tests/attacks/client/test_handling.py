@@ -4,8 +4,6 @@ What is injected here stands for what nobody has thought of. The control is the 
 what stands around it: there the injected error comes out as it is.
 """
 
-from __future__ import annotations
-
 import signal
 import struct
 import threading

@@ -4,8 +4,6 @@ Jail and repository share a process, so that nothing our code does there can be 
 counts is what the server and the client make of it: the same under every profile.
 """
 
-from __future__ import annotations
-
 import os
 import pickle
 import time

@@ -1,7 +1,5 @@
 """A worker that lies about infos that are not joined: a single environment takes none of it."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Iterator
 from contextlib import contextmanager

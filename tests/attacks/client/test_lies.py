@@ -4,8 +4,6 @@ A lie ends in one of this project's errors, executes nothing, and costs bounded 
 afterwards the client closes the environment and works on with others.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

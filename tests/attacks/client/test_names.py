@@ -5,8 +5,6 @@ serves whatever a manifest lists, and with what a worker sent unchecked: there t
 What counts is what the worker heard, which memory was read or written, and which files appeared.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import ctypes

@@ -4,8 +4,6 @@ The jail of one sub-environment replaces our code in its process. Control: a ste
 all, is held up by the same worker, so it does what it is meant to.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager

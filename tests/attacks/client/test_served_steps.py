@@ -3,8 +3,6 @@
 The server is one that lies. The control is the same server, which is honest once.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from collections.abc import Iterator

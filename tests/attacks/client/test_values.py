@@ -4,8 +4,6 @@ Each is used as programs use it. The controls take what the worker sent as it is
 runs, a process crashes, and memory becomes random numbers.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import pickle

@@ -4,8 +4,6 @@ The control is Python on the same file, where it lies. Whether something was sto
 token in what comes back.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

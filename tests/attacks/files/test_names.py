@@ -4,8 +4,6 @@ Each name is legal where a repository is made. The control lays the same files o
 does, and another file than the listing's is written, or one outside of the folder.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterator

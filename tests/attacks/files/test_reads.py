@@ -1,7 +1,5 @@
 """Reading files that a repository has no business with."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Changing files that are not the jail's: the snapshot, caches, another jail's, the host's."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import stat

@@ -1,7 +1,5 @@
 """A hostile repository: its environment runs whichever payload the test names, when it says."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 from payloads import running

@@ -7,8 +7,6 @@ came of both: ``outside``, ``inside``, ``report``, ``mounts`` of the jail's proc
 what is said of a GPU that there is not.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

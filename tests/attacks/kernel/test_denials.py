@@ -1,7 +1,5 @@
 """What is denied can be recorded; who is recorded gets no further by it, and hides nothing."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

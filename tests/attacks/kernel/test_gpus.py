@@ -4,8 +4,6 @@ There is no GPU here. The host is one whose nodes are files, in mounts that only
 words come back has been opened. Nothing in the sandbox knows the difference.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Reaching for the kernel: namespaces, mounts, rare system calls, other architectures' numbers."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A real GPU, in jails that have it and in one that has not: skipped without one."""
 
-from __future__ import annotations
-
 import contextlib
 import stat
 import subprocess

@@ -1,7 +1,5 @@
 """Sockets of the test's own, outside of every jail, that note what reaches them."""
 
-from __future__ import annotations
-
 import contextlib
 import selectors
 import socket

@@ -1,7 +1,5 @@
 """A virtual display is the jail's own: the host's is not there, and nobody outside finds it."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 import shutil

@@ -4,8 +4,6 @@ Its own is nobody else's, neither the host's nor another jail's. The host's is T
 nothing besides: no other protocol, no socket file and no service of ours.
 """
 
-from __future__ import annotations
-
 import contextlib
 import socket
 from collections.abc import Iterator

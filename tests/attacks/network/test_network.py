@@ -1,7 +1,5 @@
 """Getting something out over a network socket."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

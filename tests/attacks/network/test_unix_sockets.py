@@ -1,7 +1,5 @@
 """Reaching services of this machine through AF_UNIX: docker, an ssh agent, the system's log."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 

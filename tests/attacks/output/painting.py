@@ -1,7 +1,5 @@
 """Text that a terminal obeys, and what finds it."""
 
-from __future__ import annotations
-
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\x9b31m\r\u202e"
 
 

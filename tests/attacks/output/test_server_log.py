@@ -1,7 +1,5 @@
 """Writing into the log of a server that many share, what never happened there."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import asdict

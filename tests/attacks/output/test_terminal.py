@@ -1,7 +1,5 @@
 """Doing something through the client's terminal: typing into it, writing to it, escape codes."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

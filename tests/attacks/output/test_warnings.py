@@ -1,7 +1,5 @@
 """Warnings of a hostile repository: a flood, giants, escape sequences; and a worker that lies."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import warnings

@@ -1,7 +1,5 @@
 """What the attacks by way of git share."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -4,8 +4,6 @@ They are read in this process's stead by one that ends at a deadline. The contro
 one does without this project.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gzip
 import hashlib

@@ -4,8 +4,6 @@ The control builds the same sources as one does without this project: their back
 plain interpreter.
 """
 
-from __future__ import annotations
-
 import subprocess
 import zipfile
 from pathlib import Path

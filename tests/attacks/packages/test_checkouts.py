@@ -1,7 +1,5 @@
 """A stranger's checkout, whose ``.git`` names programs that git runs: judging it runs none."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

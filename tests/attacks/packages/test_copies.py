@@ -3,8 +3,6 @@
 Nothing here is saved by its mode: everybody may write to all of it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 The control is plain git with the same repository and the same user: there each of them succeeds.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -5,8 +5,6 @@ whether it went off outside of one. The control springs the same trap with the s
 interpreter that has the same packages, as one does without this project.
 """
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import socket

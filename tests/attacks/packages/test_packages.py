@@ -3,8 +3,6 @@
 The control uses the same folder as anybody would: a virtual environment, or ``PYTHONPATH``.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

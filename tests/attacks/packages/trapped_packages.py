@@ -4,8 +4,6 @@ Each trap leaves a file in a folder that every user may write to, and so says wh
 cannot reach that folder, and whatever else runs it can.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import os

@@ -1,7 +1,5 @@
 """Another live jail of the same server, that attacks aim at."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ secret, and prints one JSON object: what ``be_victim`` says, the jail's process,
 the server and the cache. For each line that it reads it prints how the jail is then.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -3,8 +3,6 @@
 The control aims the same payload at an ordinary process of the caller's.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

@@ -4,8 +4,6 @@ The other client is of the same user, or (started as root) of another one. Eithe
 its own. The controls aim the same payloads at a process and at files of the caller's.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import socket

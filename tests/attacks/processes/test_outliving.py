@@ -1,7 +1,5 @@
 """Living longer than the environment: daemons, and processes that keep moving."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

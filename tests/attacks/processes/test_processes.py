@@ -1,7 +1,5 @@
 """Doing something to the client's processes: reading, writing, signalling, slowing them."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import resource

@@ -1,7 +1,5 @@
 """Getting at secrets that lie in memory, environments and keyrings."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Attacking our own processes that a jail hangs from: worker server, zygote and init."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -5,8 +5,6 @@ file, permits everybody to trace it (as far as the kernel's rules allow that), c
 that reach it, and answers each line of stdin with its state.
 """
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

@@ -6,8 +6,6 @@ victim is msgpack itself instead of our decoder, and gets the first one. Address
 time for each are limited by the kernel.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import resource

@@ -5,8 +5,6 @@ stays within the memory and time of a message that is allowed. ``test_fuzz`` spo
 workers say, descriptions of spaces among it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

@@ -4,8 +4,6 @@ The seed here is the same each time, so that who changes nothing breaks nothing.
 by the command, which draws a seed and prints it. What fails says how to do it again.
 """
 
-from __future__ import annotations
-
 import pickle
 import subprocess
 import sys

@@ -4,8 +4,6 @@ The hostile side is another process with exactly those descriptors; the verdict 
 own memory, and whether the client is still alive.
 """
 
-from __future__ import annotations
-
 import mmap
 import os
 import signal

@@ -1,7 +1,5 @@
 """What the kernel counts of a run's processes."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

@@ -3,8 +3,6 @@
 The controls are tame: they take a little more than the limits of the jail, and no more.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os

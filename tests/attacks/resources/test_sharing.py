@@ -4,8 +4,6 @@ A jail of root's runs as a user of its own; one of a plain user's runs as that u
 kernel gives to a user, the caller's other programs share with it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

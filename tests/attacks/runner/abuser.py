@@ -3,8 +3,6 @@
 The client is a process of its own (``held_client``); whoever asks for it watches it from outside.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -7,8 +7,6 @@ what became of its steps, and ``closed`` at the end. Whoever started it watches 
 that comes. A neighbour, another jail of the same server, has to go on as if nothing had happened.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import threading

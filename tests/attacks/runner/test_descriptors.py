@@ -3,8 +3,6 @@
 Smuggling further ones in and out.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import errno

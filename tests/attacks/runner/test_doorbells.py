@@ -5,8 +5,6 @@ jail does with its copies of the descriptors. The control is a doorbell whose op
 both sides share: the same acts hold its writer for ever.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

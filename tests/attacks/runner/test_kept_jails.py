@@ -4,8 +4,6 @@ What a runner says, or leaves behind that goes on saying it, must count for nobo
 its sibling, nor for the server, nor for the runner that comes in its place.
 """
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Any

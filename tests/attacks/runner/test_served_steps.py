@@ -5,8 +5,6 @@ Controls: ``test_doorbells`` has the descriptor that holds its writer, ``test_sl
 that kills its reader.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import struct

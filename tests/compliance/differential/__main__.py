@@ -12,8 +12,6 @@ Each case has a number, and is the same in each run. What differs is cut down to
 that show it. The exit code is 1 if anything did.
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import sys

@@ -1,7 +1,5 @@
 """One random case: what is built, what is called, and where the two sides differ."""
 
-from __future__ import annotations
-
 import enum
 import warnings
 from collections.abc import Callable

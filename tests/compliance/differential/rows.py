@@ -4,8 +4,6 @@ The control is a ``SyncVectorEnv`` of each worker's sub-environments, since thes
 together. What others do, and who is ready first, must change nothing of what it gives.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections import deque
 from copy import deepcopy

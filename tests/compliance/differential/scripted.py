@@ -1,7 +1,5 @@
 """An environment that does what a random generator says. It travels to the sandbox by value."""
 
-from __future__ import annotations
-
 import datetime
 import decimal
 import enum

@@ -4,8 +4,6 @@ The control is Gymnasium's ``AsyncVectorEnv`` in this process, which gives each 
 own. How many processes the sandbox uses is found out by it.
 """
 
-from __future__ import annotations
-
 import importlib.util
 from dataclasses import dataclass
 from itertools import count

@@ -1,7 +1,5 @@
 """Random spaces, of every kind that Gymnasium has."""
 
-from __future__ import annotations
-
 from random import Random
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A bounded number of random cases; the command beside it runs as many as one likes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

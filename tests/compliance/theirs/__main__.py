@@ -11,8 +11,6 @@ for pytest, which runs in the checkout's root, once for each variant. The exit c
 passed.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

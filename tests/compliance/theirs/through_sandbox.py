@@ -3,8 +3,6 @@
 Imports nothing of our tests: where somebody else's tests run, ``tests`` is their package.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import json

@@ -1,7 +1,5 @@
 """Short forms of ``monkey`` and ``clients``, and that they notice what they look for."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

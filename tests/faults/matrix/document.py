@@ -3,8 +3,6 @@
 The seconds are the median cell of a row in one full run, kept in ``measured.json``.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

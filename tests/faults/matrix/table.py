@@ -3,8 +3,6 @@
 ``test_matrix.py`` tries every row; ``docs/internals/faults-tried.md`` is written from them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Every row of the fault table: what is seen, how soon, what remains, and who goes on."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import json

@@ -1,7 +1,5 @@
 """Runs small client programs as processes of their own, to be ended in every way there is."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A folder of which nothing remains: what each test here proves at its end."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -4,8 +4,6 @@
 says what was left; the tests end a handful, at moments that they wait for.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import random

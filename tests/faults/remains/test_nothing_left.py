@@ -1,7 +1,5 @@
 """However a client ends, nothing of ours remains on the machine; a fork of it ends nothing."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A client that is ended while its server starts: nothing remains, or the next one removes it."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

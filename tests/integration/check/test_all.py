@@ -1,7 +1,5 @@
 """``envhub check --all``: each of a list is judged, and the worst of them is the verdict."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

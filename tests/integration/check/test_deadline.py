@@ -1,7 +1,5 @@
 """``envhub check --deadline``: whatever takes too long, a report says what was not judged."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re

@@ -1,7 +1,5 @@
 """``envhub check``: an honest repository passes, and each fault is told by its check alone."""
 
-from __future__ import annotations
-
 import json
 import re
 from html import unescape

@@ -1,7 +1,5 @@
 """A folder is judged as its commit is: the same files and findings, and the same code runs."""
 
-from __future__ import annotations
-
 import py_compile
 import sys
 from collections.abc import Mapping

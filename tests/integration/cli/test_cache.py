@@ -1,7 +1,5 @@
 """``envhub cache`` and ``envhub inspect --download``."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

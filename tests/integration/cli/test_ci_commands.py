@@ -1,7 +1,5 @@
 """A hostile repository is printed by every command, and no CI system obeys anything of it."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

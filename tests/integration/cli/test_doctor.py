@@ -1,7 +1,5 @@
 """``envhub doctor`` says what this host can enforce, and its exit code decides."""
 
-from __future__ import annotations
-
 import json
 import os
 from typing import Any

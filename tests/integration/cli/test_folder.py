@@ -1,7 +1,5 @@
 """The command line takes no module out of the folder that it is called in."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

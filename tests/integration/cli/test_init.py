@@ -1,7 +1,5 @@
 """``envhub init``: what it writes passes its own check, by the plugin that it is written for."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """``envhub replay`` of what came from a Hub or from somebody: a pin runs, and the user decides."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

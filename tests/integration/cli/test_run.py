@@ -1,7 +1,5 @@
 """``envhub run``, ``inspect`` and ``diff --run``, each in a process of its own."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

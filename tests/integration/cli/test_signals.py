@@ -1,7 +1,5 @@
 """Ctrl-C, termination, closed pipes and terminals."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty

@@ -1,7 +1,5 @@
 """A jail's snapshot and packages are copy on write under their own paths; what is shared stays."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path

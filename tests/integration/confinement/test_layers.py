@@ -3,8 +3,6 @@
 What an environment can try is in ``tests/attacks``: files, sockets and processes outside.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import tempfile

@@ -1,7 +1,5 @@
 """Each limit of a jail stops what it names; the same source without a jail goes through."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """Variables that are read once, at the start of a process or a library, work or are refused."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

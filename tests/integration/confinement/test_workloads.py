@@ -1,7 +1,5 @@
 """What environments really do keeps working in a jail."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 

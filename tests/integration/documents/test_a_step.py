@@ -1,7 +1,5 @@
 """The pages for those who work on it are true: which files a step runs, and what the log says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

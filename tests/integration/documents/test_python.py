@@ -2,8 +2,6 @@
 notebook of the examples runs from its first cell to its last, and shows what it shows.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

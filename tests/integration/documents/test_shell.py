@@ -1,7 +1,5 @@
 """The shell of the documents does what they say, word for word, against a Hub on loopback."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

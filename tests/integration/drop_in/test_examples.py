@@ -1,7 +1,5 @@
 """The examples for other libraries run as their first lines say; RLlib's and LeRobot's by hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """``lerobot-eval`` gets the same numbers from the proxy as from an in-process environment."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Stable-Baselines3 on a sandboxed environment: as on its own ``DummyVecEnv``, to the last bit."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path

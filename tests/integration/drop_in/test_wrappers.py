@@ -1,7 +1,5 @@
 """Gymnasium's vector wrappers do the same on top of the proxy as on top of SyncVectorEnv."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any

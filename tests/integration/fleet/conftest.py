@@ -1,7 +1,5 @@
 """Servers on loopback, each with keys of its own, and a repository whose rows say who they are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path

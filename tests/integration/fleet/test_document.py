@@ -1,7 +1,5 @@
 """The Python of docs/scaling.md does what the page says, with servers on loopback."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

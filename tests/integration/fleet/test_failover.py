@@ -1,7 +1,5 @@
 """A server of a fleet goes: its rows come back elsewhere, or an error says which they are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any

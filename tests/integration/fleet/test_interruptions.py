@@ -4,8 +4,6 @@ What docs/internals/interruption.md demands of one holds for all together;
 ``tests/integration/lifecycle/test_interruptions.py`` tries starts and closes.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -3,8 +3,6 @@
 One server in this process answers for all of them, so that it is the client that is tried.
 """
 
-from __future__ import annotations
-
 import resource
 from collections.abc import Iterator
 from pathlib import Path

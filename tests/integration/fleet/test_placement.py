@@ -1,7 +1,5 @@
 """Which worker goes where, to the next place where one has no room; and with which packages."""
 
-from __future__ import annotations
-
 import json
 import pickle
 from collections import Counter

@@ -1,7 +1,5 @@
 """``send`` and ``recv`` over servers: the wire's delay is hidden, and a lost server is its own."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 from collections.abc import Callable

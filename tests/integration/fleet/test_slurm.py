@@ -1,7 +1,5 @@
 """The job script for SLURM, with something that runs commands on "nodes" of this machine."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """``EnvSuites.map``: many tasks at once, over whatever the sandbox is."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 

@@ -1,7 +1,5 @@
 """How a repository of the Hub that lies and fails is fetched."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What an environment finds in its cache of the Hub: its own files, and assets; in a jail."""
 
-from __future__ import annotations
-
 import pickle
 import tempfile
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Every way in which a Hub can say no: each has an error of its own that says what to do."""
 
-from __future__ import annotations
-
 import base64
 import logging
 import os

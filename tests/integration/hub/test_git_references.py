@@ -1,7 +1,5 @@
 """``git+https://host/org/repo@commit:path``: a repository of git as one of the Hub."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import shutil

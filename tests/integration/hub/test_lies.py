@@ -1,7 +1,5 @@
 """A pin is verified, not believed: lying servers, edited caches, broken downloads."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

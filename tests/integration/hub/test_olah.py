@@ -1,7 +1,5 @@
 """The real huggingface_hub client against real git repositories, served on loopback."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 Python looks for signals where a function begins, so these are the moments that are tried.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The worker server stays a while when the last environment is closed, and never outlives us."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

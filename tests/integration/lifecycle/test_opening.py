@@ -1,7 +1,5 @@
 """What is asked of a server, and what it has started, until an environment of a known pin is up."""
 
-from __future__ import annotations
-
 import os
 import resource
 from collections import Counter

@@ -2,8 +2,6 @@
 one plays: bounded, given up, and never felt.
 """
 
-from __future__ import annotations
-
 import concurrent.futures
 import contextlib
 import gc

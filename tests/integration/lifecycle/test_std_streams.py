@@ -1,7 +1,5 @@
 """A program that was started without standard streams has environments as any other."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Everything works under every umask, as whoever runs it; what is private stays so."""
 
-from __future__ import annotations
-
 import os
 import stat
 import subprocess

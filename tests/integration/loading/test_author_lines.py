@@ -1,7 +1,5 @@
 """What an environment raises leads to the line that raised it, in a real jail."""
 
-from __future__ import annotations
-
 import traceback
 from pathlib import Path
 from typing import Any

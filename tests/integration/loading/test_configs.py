@@ -1,7 +1,5 @@
 """A caller's config object, as the repository's ``make_env`` gets it for ``cfg``."""
 
-from __future__ import annotations
-
 import sys
 import types
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """How repositories are laid out, what their ``make_env`` may look like, and what goes wrong."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Vector environments of a repository's own class, which declare their spaces as they like."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

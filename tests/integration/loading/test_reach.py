@@ -1,7 +1,5 @@
 """What an environment wants when it starts: command line, home, sockets, downloads and windows."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Environments by other authors, through ``make_env``, each for what is special about it."""
 
-from __future__ import annotations
-
 import os
 from typing import Any
 

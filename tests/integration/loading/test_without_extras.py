@@ -1,7 +1,5 @@
 """The core alone: an installation without extras makes environments, and says what it lacks."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

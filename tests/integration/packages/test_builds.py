@@ -1,7 +1,5 @@
 """Sources become wheels in a jail, with what they are built with and nothing else; once."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A repository comes up with nothing but its reference: with its packages, which are not ours."""
 
-from __future__ import annotations
-
 import datetime
 import importlib.util
 import os

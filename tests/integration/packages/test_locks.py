@@ -1,7 +1,5 @@
 """``make_env(lock=)`` and ``envhub lock [--check]``: what was locked runs, and only that."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``pypi:NAME@VERSION#ID``: an environment that a package registers, without a repository."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

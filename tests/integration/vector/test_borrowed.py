@@ -1,7 +1,5 @@
 """``copy=False``: observations that are lent, and still never change under whoever holds them."""
 
-from __future__ import annotations
-
 import mmap
 from typing import Any
 

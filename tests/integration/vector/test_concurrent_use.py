@@ -1,7 +1,5 @@
 """Two threads that use one environment at once: the second waits, and close does not."""
 
-from __future__ import annotations
-
 import threading
 import time
 import warnings

@@ -4,8 +4,6 @@ The oracle is what LeRobot's ``FreezeAfterEpisodeEnd`` does around each sub-envi
 ``tests/lerobot`` compares with that class itself.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """``np_random`` is the environment's own: draws on either side continue those on the other."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """Deaths, time-outs, Ctrl-C and ``close`` while workers are at what they were sent."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

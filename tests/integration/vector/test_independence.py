@@ -1,7 +1,5 @@
 """Asynchronous sub-environments: a process each, or shared ones where that is equal."""
 
-from __future__ import annotations
-
 import importlib.util
 import threading
 import time

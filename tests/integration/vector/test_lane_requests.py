@@ -1,7 +1,5 @@
 """What a lane carries: requests, several steps at once, what is too large; nothing is mixed up."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Real lanes say when their step has been answered, and what to poll until then."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterator

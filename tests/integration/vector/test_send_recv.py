@@ -1,7 +1,5 @@
 """``send`` and ``recv``: who is ready first comes first, and what is refused meanwhile."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

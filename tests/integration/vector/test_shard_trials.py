@@ -1,7 +1,5 @@
 """Uses of one pin that are cut in different ways, and give the same."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -2,8 +2,6 @@
 environment gives, type by type, and sets what is set.
 """
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import json

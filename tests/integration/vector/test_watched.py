@@ -1,7 +1,5 @@
 """Attributes that are asked for after each step: watched, and never another value than there is."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 from pathlib import Path

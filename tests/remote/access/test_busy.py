@@ -1,7 +1,5 @@
 """A server without room says so as data, and clients that are told to wait do so in order."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Iterator

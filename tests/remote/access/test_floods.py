@@ -1,7 +1,5 @@
 """Floods of peers without keys, and of what clients with keys once sent: the others go on."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -1,7 +1,5 @@
 """Keys as text and as files, what a server says when it starts, and who may ask it."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import os

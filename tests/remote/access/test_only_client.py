@@ -1,7 +1,5 @@
 """A server that a program starts for one client, and that ends with that program."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import subprocess

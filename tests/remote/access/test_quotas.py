@@ -1,7 +1,5 @@
 """What a client on another host may have, and how much of it."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A client's place on a server: whose it is, and that whoever has gone takes none."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What a client on another host may have a server make for its runners."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Who has no key, or the wrong one: refused, bounded and logged, while a client's work goes on."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import errno

@@ -1,7 +1,5 @@
 """A client without Linux: what it does with a server on another host, and what it says."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

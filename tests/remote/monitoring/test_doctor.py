@@ -1,7 +1,5 @@
 """``envhub doctor tcp://...``: what a server says about itself, and whether it lets us in."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

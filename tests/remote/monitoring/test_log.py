@@ -1,7 +1,5 @@
 """What a server writes down: a line an event, as an operator and his programs read it."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -3,8 +3,6 @@
 The port has no keys: so there are attacks on it, while a client's work goes on.
 """
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import os

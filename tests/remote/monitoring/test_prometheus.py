@@ -1,7 +1,5 @@
 """A real Prometheus scrapes a server at work, and every panel of the dashboard is asked of it."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

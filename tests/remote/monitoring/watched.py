@@ -1,7 +1,5 @@
 """A server with a port of figures, and a reader of these."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import re

@@ -1,7 +1,5 @@
 """A Ray cluster for tests, and what runs on its nodes as the kernel sees it."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

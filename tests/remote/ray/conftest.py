@@ -1,7 +1,5 @@
 """One cluster of two nodes for all tests of this folder that leave it as it was."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ Whoever reaches a Ray cluster runs code on all of it, so an actor that is there 
 whole of the damage. Each attack succeeds in the same run where nothing confines it.
 """
 
-from __future__ import annotations
-
 import os
 import secrets
 import subprocess

@@ -1,7 +1,5 @@
 """Actors, nodes, drivers and the head end at any moment: nothing is left, and the error says so."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """The blocks of ``docs/ray.md`` do what they say, on a cluster."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

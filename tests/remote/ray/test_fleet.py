@@ -1,7 +1,5 @@
 """One environment over several nodes: what one place gives, and only the rows of a lost one end."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """``sandbox="ray"``: a worker server where Ray places it, with the results of any other place."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from pathlib import Path

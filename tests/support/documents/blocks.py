@@ -4,8 +4,6 @@ Shell and Python are executed with the others of their document, but for what ``
 ``NOT_EXECUTED`` name by its beginning.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass

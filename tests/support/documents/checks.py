@@ -3,8 +3,6 @@
 Write it again with ``python -m tests.support.documents.checks``.
 """
 
-from __future__ import annotations
-
 import textwrap
 
 from envhub_sandbox.extras.judge.checks import CHECKS

@@ -3,8 +3,6 @@
 ``python -m tests.support.documents.notebook`` executes them and writes what they display into it.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import os

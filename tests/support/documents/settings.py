@@ -3,8 +3,6 @@
 Write it again with ``python -m tests.support.documents.settings``.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import re

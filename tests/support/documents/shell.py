@@ -5,8 +5,6 @@ documents name. ``_READ_AS`` is what a reader puts in place of what is written, 
 does between the lines; other than that, the shell gets the text.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random

@@ -1,7 +1,5 @@
 """The parts of ``docs/`` that are written from the code: each stands between two comments."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

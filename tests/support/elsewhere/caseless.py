@@ -1,7 +1,5 @@
 """A file system without case, such as macOS and Windows have, for one folder of this process."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

@@ -14,8 +14,6 @@ What cannot be had: drive letters and backslashes, a file system without case, l
 ``msvcrt``, which are those of Linux here, and that a file that is open cannot be renamed.
 """
 
-from __future__ import annotations
-
 import builtins
 import importlib
 import io

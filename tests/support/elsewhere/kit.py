@@ -1,7 +1,5 @@
 """Starts programs of ours as if on macOS or on Windows."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

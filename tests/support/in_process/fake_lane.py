@@ -1,7 +1,5 @@
 """An environment without a jail: real session and requests, over a lane that answers at once."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace

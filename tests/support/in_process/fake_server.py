@@ -1,7 +1,5 @@
 """A connection to a server that is not there: a test answers what was sent, when it likes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import count
 from typing import Any

@@ -1,7 +1,5 @@
 """Ctrl-C at a moment that is chosen, and not met by luck."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What programs do with any object that they meet, and which names they look for in it then."""
 
-from __future__ import annotations
-
 import collections
 import contextlib
 import copy

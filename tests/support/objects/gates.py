@@ -1,7 +1,5 @@
 """Environments whose steps end when a test says so, and not when time does."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Values that a caller may hand to an environment: one of every kind that Python and numpy have."""
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import datetime

@@ -1,7 +1,5 @@
 """Steps of which several are on their way, and the same steps one by one."""
 
-from __future__ import annotations
-
 import warnings
 from collections import deque
 from collections.abc import Callable

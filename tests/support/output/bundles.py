@@ -1,7 +1,5 @@
 """Crash bundles of an environment that dies as its sample says."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

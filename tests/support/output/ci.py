@@ -1,7 +1,5 @@
 """What a CI system obeys of a log, and programs whose output goes to a pipe or to a terminal."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import os

@@ -1,7 +1,5 @@
 """A page as a parser takes it, and what pages are made of where a stranger chose every word."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 
 import numpy as np

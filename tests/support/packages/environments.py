@@ -1,7 +1,5 @@
 """Folders of packages, installed as for a repository of its own, and what makes jails use them."""
 
-from __future__ import annotations
-
 import functools
 import shutil
 import subprocess

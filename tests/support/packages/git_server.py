@@ -1,7 +1,5 @@
 """Repositories of git on loopback, served by git's own program for that."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from collections.abc import Callable, Iterator, Mapping

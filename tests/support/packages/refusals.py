@@ -1,7 +1,5 @@
 """What is expected where packages are refused."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

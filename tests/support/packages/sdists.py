@@ -1,7 +1,5 @@
 """Source distributions that are made here, with a build backend of their own."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import tarfile

@@ -1,7 +1,5 @@
 """A package index on loopback, of wheels that are made here: no network, and nothing large."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import html

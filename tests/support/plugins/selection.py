@@ -9,8 +9,6 @@ CI repeats some tests as another user and with other versions of Python and of p
 ``--one-case``: of a test's cases the first, for each profile and each lane that it names.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
