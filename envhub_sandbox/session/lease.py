@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError, WorkerError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    RemoteEnvError,
+    ServerBusyError,
+    WorkerDiedError,
+    WorkerError,
+)
 from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.sandbox import is_draining, is_unanswered, retry_while_busy
 from envhub_sandbox.session.builder import Builder, JailSource
@@ -146,6 +152,17 @@ class Lease:
         loaded = self.loaded  # another thread may give it back
         if loaded is not None:
             loaded.lost = True
+
+    def watched(self, name: str) -> AttributeAnswer | None:
+        """What is known of a watched attribute, while the environment can be asked."""
+        if self.lane is None or self.lifecycle.state is not State.READY:
+            return None
+        return self.lane.jail.watched.values(self.lane.number, name)
+
+    def note_watched(self, name: str, values: AttributeAnswer) -> bool:
+        """Keep the values of an attribute that the runners watch; whether they can be kept."""
+        lane = self.lane
+        return lane is not None and lane.jail.watched.note(lane.number, name, values)
 
     def forget_watched(self) -> None:
         """A reply is lost that may have named changed attributes, of any environment there."""
@@ -351,16 +368,16 @@ class _Reads:
     """The reads of one attribute.
 
     Attributes:
-        step: How many steps there had been at the last one.
+        steps: How many steps each worker had answered at the last one.
         rounds: How many came after a step, since it was last watched.
         patience: How many are needed until it is watched.
         watched: Whether it was, at the last answer.
     """
 
-    __slots__ = ("patience", "rounds", "step", "watched")
+    __slots__ = ("patience", "rounds", "steps", "watched")
 
-    def __init__(self, step: int) -> None:
-        self.step, self.rounds, self.patience, self.watched = step, 0, 1, False
+    def __init__(self, steps: list[int]) -> None:
+        self.steps, self.rounds, self.patience, self.watched = steps, 0, 1, False
 
 
 class AttributeCache:
@@ -370,76 +387,60 @@ class AttributeCache:
     request, which costs as much as the step, and on another host a round trip. A watched attribute
     (``envhub_worker.runner.prefixes``) is answered from here, once a step: a caller that reads it
     twice waits for something to happen, and the environment answers.
+
+    ``leases``: one for each worker of the environment.
+    ``rows``: the slice of the sub-environments that each worker has.
     """
 
-    def __init__(self, lease: Lease) -> None:
-        self._lease = lease
-        self._counters = lease.counters
+    def __init__(self, leases: Sequence[Lease], rows: Sequence[tuple[int, int]]) -> None:
+        self._leases = leases
+        self._rows = rows
         self._reads: dict[str, _Reads] = {}
 
     def get(self, name: str) -> AttributeAnswer | None:
         """The values, if a step was answered since the last read; None: a request is needed."""
-        reads, lane = self._reads.get(name), self._lease.lane
-        if reads is None or lane is None or reads.step == self._counters.steps:
+        reads = self._reads.get(name)
+        if reads is None:
             return None
-        if self._lease.lifecycle.state is not State.READY:
-            return None
-        values = lane.jail.watched.values(lane.number, name)
-        if values is not None:
-            reads.step = self._counters.steps
-        return values
+        gathered: list[Any] = []
+        error: RemoteEnvError | None = None
+        for lease, step in zip(self._leases, reads.steps, strict=True):
+            answer = lease.watched(name)
+            if answer is None or lease.counters.steps == step:
+                return None
+            if isinstance(answer, RemoteEnvError):
+                error = answer
+            else:
+                gathered += answer
+        reads.steps = self._steps()
+        return error or tuple(gathered)
 
     def should_watch(self, name: str) -> bool:
         """A request for it follows: whether that request is to have it watched."""
-        lane, steps = self._lease.lane, self._counters.steps
-        if lane is None:
+        if any(lease.lane is None for lease in self._leases):
             return False
+        steps = self._steps()
         reads = self._reads.get(name)
         if reads is None:
             if len(self._reads) < _MOST_READ:
                 self._reads[name] = _Reads(steps)
             return False
-        if reads.watched and lane.jail.watched.values(lane.number, name) is None:
+        if reads.watched and any(lease.watched(name) is None for lease in self._leases):
             # it has changed: with each time that it does, it takes twice as long to be watched
             reads.watched, reads.rounds, reads.patience = False, 0, 2 * reads.patience
-        reads.rounds += reads.step != steps
-        reads.step = steps
+        reads.rounds += reads.steps != steps
+        reads.steps = steps
         return reads.rounds >= reads.patience
 
     def put(self, name: str, values: AttributeAnswer, *, watched: bool) -> None:
         """Keep the answer to a request after ``should_watch``; ``watched`` is the runners' word."""
-        lane, reads = self._lease.lane, self._reads[name]
-        reads.watched = (
-            watched and lane is not None and lane.jail.watched.note(lane.number, name, values)
-        )
+        reads = self._reads[name]
+        reads.watched = watched
+        for lease, (start, stop) in zip(self._leases, self._rows, strict=True):
+            own = values[start:stop] if isinstance(values, tuple) else values
+            reads.watched = reads.watched and lease.note_watched(name, own)
         if not reads.watched:
             reads.patience = _NEVER
 
-
-class FleetAttributes:
-    """Those of an environment over several workers: see ``AttributeCache``."""
-
-    def __init__(self, parts: Sequence[AttributeCache], bounds: Sequence[tuple[int, int]]) -> None:
-        self._parts = parts
-        self._bounds = bounds
-
-    def get(self, name: str) -> AttributeAnswer | None:
-        """The values, if all parts know theirs."""
-        gathered: list[Any] = []
-        for part in self._parts:
-            values = part.get(name)
-            if type(values) is not tuple:
-                return values
-            gathered += values
-        return tuple(gathered)
-
-    def should_watch(self, name: str) -> bool:
-        """Whether every part is to be asked to watch it."""
-        wanted = [part.should_watch(name) for part in self._parts]  # each takes note of it
-        return all(wanted)
-
-    def put(self, name: str, values: AttributeAnswer, *, watched: bool) -> None:
-        """Keep the answers of all parts."""
-        for part, (start, stop) in zip(self._parts, self._bounds, strict=True):
-            own = values[start:stop] if isinstance(values, tuple) else values
-            part.put(name, own, watched=watched)
+    def _steps(self) -> list[int]:
+        return [lease.counters.steps for lease in self._leases]

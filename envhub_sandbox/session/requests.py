@@ -27,7 +27,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.session.failures import Failures, refusal
-from envhub_sandbox.session.lease import AttributeCache, FleetAttributes, Lease
+from envhub_sandbox.session.lease import AttributeCache, Lease
 from envhub_sandbox.session.prewarm import Prewarm
 from envhub_sandbox.session.recorder import Recorder
 from envhub_sandbox.session.repository import Repository
@@ -86,7 +86,7 @@ class RequestOrder(ABC):
         repository: Repository,
         results: Results,
         use: UseLock | FleetUse,
-        attributes: AttributeCache | FleetAttributes,
+        attributes: AttributeCache,
     ) -> None:
         self.results = results
         self.use = use
@@ -236,7 +236,6 @@ class Requests(RequestOrder):
     """The requests to one jail, which is opened by the first of them."""
 
     use: UseLock
-    attributes: AttributeCache
 
     def __init__(
         self,
@@ -247,7 +246,8 @@ class Requests(RequestOrder):
         failures: Failures,
         recovery: Recovery | None,
     ) -> None:
-        super().__init__(lease.repository, lease.results, use, AttributeCache(lease))
+        attributes = AttributeCache([lease], [(0, lease.results.count)])
+        super().__init__(lease.repository, lease.results, use, attributes)
         self.lifecycle = lease.lifecycle
         self._lease = lease
         self._prewarm = prewarm

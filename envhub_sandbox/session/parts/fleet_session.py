@@ -27,7 +27,7 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.session.counters import LEDGER, FleetCounters, Labels
 from envhub_sandbox.session.env_session import GRACE_S, EnvSession
-from envhub_sandbox.session.lease import FleetAttributes
+from envhub_sandbox.session.lease import AttributeCache
 from envhub_sandbox.session.prewarm import FleetPrewarm
 from envhub_sandbox.session.recorder import Recorder
 from envhub_sandbox.session.recovery import mark_revived
@@ -61,10 +61,8 @@ _WORST = (
 
 class FleetSession:
     """The life of one vector environment in several jails: see ``EnvSession``.
-
-    Args:
-        parts: One for each worker, in the order of their sub-environments.
-        recorder: Of the whole environment; the parts were made with it.
+    ``parts``: one for each worker, in the order of their sub-environments.
+    ``recorder``: of the whole environment; the parts were made with it.
     """
 
     def __init__(self, parts: Sequence[EnvSession], recorder: Recorder) -> None:
@@ -198,9 +196,7 @@ class FleetRequests(RequestOrder):
         self._parts = parts
         self._each: list[Requests] = [part.requests for part in parts]
         use = FleetUse([part.use for part in parts])
-        attributes = FleetAttributes(
-            [requests.attributes for requests in self._each], results.bounds
-        )
+        attributes = AttributeCache([part.lease for part in parts], results.bounds)
         super().__init__(parts[0].repository, results, use, attributes)
         self._recorder = recorder
         self._counters = counters

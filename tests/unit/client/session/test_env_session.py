@@ -67,7 +67,7 @@ def test_only_counts_are_taken_for_usage(lie: dict[str, object]) -> None:
 def test_the_second_read_is_watched_and_the_third_is_free() -> None:
     """Once a step: a second read in the same step is a request."""
     session = session_over(FakeLane())
-    cache = AttributeCache(session.lease)
+    cache = AttributeCache([session.lease], [(0, 2)])
     assert cache.get("task") is None
     assert not cache.should_watch("task")
     session.counters.stepped(1)
@@ -83,7 +83,7 @@ def test_the_second_read_is_watched_and_the_third_is_free() -> None:
 def test_what_is_not_watched_is_not_asked_for_again(values: tuple[Any, ...], watched: bool) -> None:
     """The runners say so, or its values can change without them: a list."""
     session = session_over(FakeLane())
-    cache = AttributeCache(session.lease)
+    cache = AttributeCache([session.lease], [(0, 2)])
     for _ in range(2):
         cache.should_watch("name")
         session.counters.stepped(1)
