@@ -13,7 +13,7 @@ from __future__ import annotations
 import importlib.util
 import io
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cache, partial
 from types import FunctionType
 from typing import Any, NoReturn, Union
@@ -37,24 +37,20 @@ from envhub_worker.protocol.spaces.reader import (
     SpaceReader,
 )
 
-_Check = Callable[[Any], bool]
-_Form = Mapping[str, Union[_Check, "_Form"]]
-_KEY_WORDS = 624
-"""Of the Mersenne twister."""
+_Form = Mapping[str, Union[range, tuple[Any, int], "_Form"]]
+"""The fields of a state: integers of a range, arrays of a dtype and a length, further fields."""
 
 
 def generator(state: object) -> np.random.Generator:
     """A generator in a given state. Trust: the state is input from the worker.
-
-    Raises:
-        RemoteProtocolError: It is no state that a generator can have.
+    Raises ``RemoteProtocolError``: it is no state that a generator can have.
     """
     name = state.get("bit_generator") if type(state) is dict else None
     form = _FORMS.get(name) if type(name) is str else None
-    if form is None or name is None:
+    if form is None or type(state) is not dict or type(name) is not str:
         raise RemoteProtocolError("the worker sent the state of an unknown random generator")
-    wrong = _misfit(form, state, name)
-    if wrong is not None:
+    fields = {field: part for field, part in state.items() if field != "bit_generator"}
+    if wrong := _misfit(form, fields, name):
         raise RemoteProtocolError(f"the worker sent a broken generator state: {wrong}")
     bits = getattr(np.random, name)()
     try:
@@ -66,9 +62,7 @@ def generator(state: object) -> np.random.Generator:
 
 def seeds(value: object) -> Any:
     """A seed, or one each. Trust: input from the worker.
-
-    Raises:
-        RemoteProtocolError: It is neither a number nor None.
+    Raises ``RemoteProtocolError``: it is neither a number nor None.
     """
     for seed in value if type(value) is tuple else (value,):
         if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer))):
@@ -80,60 +74,40 @@ def _misfit(form: _Form, value: Any, path: str) -> str | None:
     """Which field has no such value; fields are exactly those of the form."""
     if type(value) is not dict or value.keys() != form.keys():
         return f"{path} has the fields {', '.join(form)}"
-    for name, check in form.items():
-        if isinstance(check, Mapping):
-            wrong = _misfit(check, value[name], name)
-            if wrong is not None:
+    for name, wanted in form.items():
+        if isinstance(wanted, Mapping):
+            if wrong := _misfit(wanted, value[name], name):
                 return wrong
-        elif not check(value[name]):
+        elif not _fits(wanted, value[name]):
             return f"{name} has a value that it never has"
     return None
 
 
-def _below(limit: int) -> _Check:
-    return lambda value: type(value) is int and 0 <= value < limit
-
-
-def _is_position(value: Any) -> bool:
-    return type(value) is int and 1 <= value <= 4  # of the next draw: 4 fills the buffer first
-
-
-def _words(count: int) -> _Check:
-    return lambda value: (
-        type(value) is np.ndarray and value.dtype == np.uint64 and value.shape == (count,)
-    )
-
-
-def _is_odd(value: Any) -> bool:
-    """An increment without which the generator's period is shorter, down to standing still."""
-    return _below(1 << 128)(value) and value % 2 == 1
-
-
-def _is_key(value: Any) -> bool:
-    if type(value) is not np.ndarray or value.dtype != np.uint32 or value.shape != (_KEY_WORDS,):
+def _fits(wanted: range | tuple[Any, int], value: Any) -> bool:
+    if isinstance(wanted, range):
+        return type(value) is int and value in wanted
+    dtype, count = wanted
+    if type(value) is not np.ndarray or value.dtype != dtype or value.shape != (count,):
         return False
-    return bool(value[0] >> 31 or value[1:].any())  # else it yields zeros for ever
+    # a key of the Mersenne twister without one of these bits yields zeros for ever
+    return count != _KEY_WORDS or bool(value[0] >> 31 or value[1:].any())
 
 
-def _is_name(value: Any) -> bool:
-    return True  # its form was found by it
-
-
-_HALF: _Form = {"has_uint32": _below(2), "uinteger": _below(1 << 32)}
-_NAMED: _Form = {"bit_generator": _is_name}
-_PCG: _Form = {**_NAMED, "state": {"state": _below(1 << 128), "inc": _is_odd}, **_HALF}
+_KEY_WORDS = 624
+_HALF: _Form = {"has_uint32": range(2), "uinteger": range(1 << 32)}
+# an even increment shortens the period of a PCG64, down to standing still
+_PCG: _Form = {"state": {"state": range(1 << 128), "inc": range(1, 1 << 128, 2)}, **_HALF}
 _FORMS: dict[str, _Form] = {
     "PCG64": _PCG,
     "PCG64DXSM": _PCG,
-    "MT19937": {**_NAMED, "state": {"key": _is_key, "pos": _below(_KEY_WORDS + 1)}},
+    "MT19937": {"state": {"key": (np.uint32, _KEY_WORDS), "pos": range(_KEY_WORDS + 1)}},
     "Philox": {
-        **_NAMED,
-        "state": {"counter": _words(4), "key": _words(2)},
-        "buffer": _words(4),
-        "buffer_pos": _is_position,
+        "state": {"counter": (np.uint64, 4), "key": (np.uint64, 2)},
+        "buffer": (np.uint64, 4),
+        "buffer_pos": range(1, 5),  # of the next draw: 4 fills the buffer first
         **_HALF,
     },
-    "SFC64": {**_NAMED, "state": {"state": _words(4)}, **_HALF},
+    "SFC64": {"state": {"state": (np.uint64, 4)}, **_HALF},
 }
 
 
@@ -154,10 +128,8 @@ def installed_torch() -> Any:
 
 def to_tensor(array: npt.NDArray[Any], dtype: str) -> Any:
     """A tensor that owns its memory, or the array if there is no torch.
-
-    Args:
-        array: The bits, owned and writable; ``uint16`` for ``bfloat16``.
-        dtype: Torch's name of the dtype, out of the codec's table.
+    ``array``: the bits, owned and writable; ``uint16`` for ``bfloat16``.
+    ``dtype``: torch's name of the dtype, out of the codec's table.
     """
     torch = installed_torch()
     if torch is None:
@@ -173,9 +145,7 @@ _SHOWN = 200
 
 class DescriptionReader:
     """What one message describes, out of one budget: all of it costs no more than its bytes may.
-
-    Args:
-        limits: What the message may hold.
+    ``limits``: what the message may hold.
     """
 
     def __init__(self, limits: WireLimits) -> None:
@@ -183,9 +153,7 @@ class DescriptionReader:
 
     def __call__(self, code: int, value: object) -> object:
         """The thing that is described. Trust: input from the worker.
-
-        Raises:
-            RemoteProtocolError: There can be none like it, or it costs too much.
+        Raises ``RemoteProtocolError``: there can be none like it, or it costs too much.
         """
         if code == SPACE:
             return self._reader.space(value)
@@ -213,9 +181,7 @@ def spec_of(given: dict[str, Any] | None) -> EnvSpec | None:
     """A spec with these facts, as ``read_spec`` lets them through.
 
     A string names what refuses, so that it can be written as JSON like any other.
-
-    Args:
-        given: ``id``, ``max_episode_steps``, ``reward_threshold``, ``nondeterministic``.
+    ``given``: ``id``, ``max_episode_steps``, ``reward_threshold``, ``nondeterministic``.
     """
     # gym.make imports what stands before a colon
     if given is None or given.get("id") is None or ":" in given["id"]:
@@ -229,9 +195,7 @@ def spec_of(given: dict[str, Any] | None) -> EnvSpec | None:
 
 def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
     """What ``gym.make`` calls with the spec of a sub-environment, or one in an info.
-
-    Raises:
-        gymnasium.error.Error: Always.
+    Raises ``gymnasium.error.Error``: always.
     """
     named = f", {reference}" if reference else ""
     raise gym.error.Error(
@@ -242,14 +206,10 @@ def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
 
 def pickled(value: object, *, lasting: bool = False) -> bytes:
     """What the jail makes the same value of; a class of ``__main__`` travels along.
-
-    Args:
-        value: One that the wire has no form for.
-        lasting: Whether the bytes must say all there is to it: no code of the caller's own is
-            named in them.
-
-    Raises:
-        TypeError: Such code is named; who knows what it is by the next time.
+    ``value``: one that the wire has no form for.
+    ``lasting``: whether the bytes must say all there is to it: no code of the caller's own is named
+    in them.
+    Raises ``TypeError``: such code is named; who knows what it is by the next time.
     """
     buffer = io.BytesIO()
     pickler = _pickler()(buffer)
