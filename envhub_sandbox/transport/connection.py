@@ -190,12 +190,10 @@ class WorkerConnection:
     def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Buffer]]:
         """The reply to a request, with its payload. Replies to others are dropped and counted,
         unless they are to be kept.
-
-        Raises:
-            WorkerTimeoutError: The deadline came first. The reply may still come; it is dropped.
-            WorkerDiedError: The worker server has ended, or the connection to it is lost.
-            SandboxUnavailableError: A server on another host does not let us in.
-            RemoteProtocolError: What came is not a reply.
+        Raises ``WorkerTimeoutError``: the deadline came first, and a reply that still comes is
+        dropped; ``WorkerDiedError``: the worker server has ended, or the connection to it is lost;
+        ``SandboxUnavailableError``: a server on another host does not let us in;
+        ``RemoteProtocolError``: what came is not a reply.
         """
         self.check_process()
         while True:
@@ -363,9 +361,7 @@ class WorkerConnection:
 
     def check_process(self) -> None:
         """Refuse in a forked child: the connection belongs to the parent.
-
-        Raises:
-            WorkerError: This is not the process that made the connection.
+        Raises ``WorkerError``: this is not the process that made the connection.
         """
         if os.getpid() != self._owner.pid:
             raise WorkerError(fork_error_text(self._owner.pid))
@@ -380,39 +376,29 @@ class WorkerConnection:
 
 def describe_exit(process_fd: int) -> str:
     """How a server ended and what to do, as the rest of a sentence. The process stays to be reaped.
-
-    Args:
-        process_fd: A pidfd of it, or of the monitor of its container.
+    ``process_fd``: a pidfd of it, or of the monitor of its container.
     """
-    status = None
+    how = ""
     if sys.platform == "linux":
         with contextlib.suppress(OSError):  # it was reaped already, or it is no process
             status = os.waitid(os.P_PIDFD, process_fd, os.WEXITED | os.WNOHANG | os.WNOWAIT)
-        if status is not None and status.si_code in (os.CLD_KILLED, os.CLD_DUMPED):
-            number = status.si_status
-            return f" by {_signal_name(number)}{_culprit(number)}. {_what_next()}"
-    if status is None:
-        return f". {_what_next()}"
-    number = status.si_status - _KILLED_IN_A_CONTAINER
-    if number in signal.valid_signals():
-        advice = "; the container's own limit is DockerSandbox(memory=...) in Python"
-        why = _culprit(number) + (advice if number == _SIGKILL else "")
-        return f" with its container, by {_signal_name(number)}{why}. {_what_next()}"
-    return f", with exit code {status.si_status}. {_what_next()}"
-
-
-def _what_next() -> str:
+            if status is not None:
+                killed = status.si_code in (os.CLD_KILLED, os.CLD_DUMPED)
+                how = _how_it_ended(status.si_status, killed=killed)
     fresh = option_name("restart", "on_reset")
-    return f"The next make_env, or with {fresh} the next reset(), starts another"
+    return f"{how}. The next make_env, or with {fresh} the next reset(), starts another"
 
 
-def _signal_name(number: int) -> str:
+def _how_it_ended(status: int, *, killed: bool) -> str:
+    number = status if killed else status - _KILLED_IN_A_CONTAINER
+    if not killed and number not in signal.valid_signals():
+        return f", with exit code {status}"
+    name = f"signal {number}"
     with contextlib.suppress(ValueError):
-        return signal.Signals(number).name
-    return f"signal {number}"
-
-
-def _culprit(number: int) -> str:
-    if number != _SIGKILL:
-        return ""
-    return ", by another process or by the kernel, as where memory runs out (dmesg says so)"
+        name = signal.Signals(number).name
+    text = f" by {name}" if killed else f" with its container, by {name}"
+    if number == _SIGKILL:
+        text += ", by another process or by the kernel, as where memory runs out (dmesg says so)"
+        if not killed:
+            text += "; the container's own limit is DockerSandbox(memory=...) in Python"
+    return text

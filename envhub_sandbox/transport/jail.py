@@ -153,13 +153,17 @@ class JailHandle:
         self, operation: str, messages: Sequence[m.Message], bounds: list[tuple[int, int]]
     ) -> Request:
         """A request of a message for each shard, ready to be sent.
-
-        Raises:
-            LocalProtocolError: It cannot be sent.
+        Raises ``LocalProtocolError``: it cannot be sent.
         """
-        pickler = _NotingPickler()
+        pickled = False
+
+        def pickler(value: object) -> bytes | memoryview:
+            nonlocal pickled
+            pickled = True
+            return framed(value)
+
         frames = [m.pack(message, pickler=pickler, limits=self.limits) for message in messages]
-        return Request(operation, messages, frames, bounds, plain=pickler.plain)
+        return Request(operation, messages, frames, bounds, plain=not pickled)
 
     def relay(
         self, operation: str, requests: Sequence[tuple[int, Frames]], *, deposited: bool = False
@@ -181,12 +185,9 @@ class JailHandle:
         self, request_id: int, deadline: Deadline, unpack: Unpack | None = None
     ) -> list[Any]:
         """The runners' replies, in the order of the request, or what ``unpack`` makes of them.
-
-        Raises:
-            WorkerTimeoutError: The deadline came first.
-            WorkerDiedError: The jail ended.
-            RunnersDiedError: Runners of a kept jail did.
-            RemoteProtocolError: A runner broke the rules.
+        Raises ``WorkerTimeoutError``: the deadline came first; ``WorkerDiedError``: the jail ended;
+        ``RunnersDiedError``: runners of a kept jail did; ``RemoteProtocolError``: a runner broke
+        the rules.
         """
         reply, payload = self.client.receive(request_id, deadline)
         count = self._asked.pop(request_id, None)
@@ -267,9 +268,7 @@ class JailHandle:
 
     def output(self, operation: str, deadline: Deadline) -> str:
         """The last lines that the jail printed.
-
-        Raises:
-            WorkerDiedError: The jail has ended, during ``operation``.
+        Raises ``WorkerDiedError``: the jail has ended, during ``operation``.
         """
         reply, _ = self.client.request(m.ReadOutput(self.number, operation), deadline=deadline)
         return expect_reply(reply, m.Output).text
@@ -327,17 +326,6 @@ def _cut(payload: Frames, counts: Sequence[int]) -> list[Frames]:
     return [list(islice(frames, count)) for count in counts]
 
 
-class _NotingPickler:
-    """Pickles the caller's own objects, and notes that it has. Nothing is ever unpickled here."""
-
-    def __init__(self) -> None:
-        self.plain = True
-
-    def __call__(self, value: object) -> bytes | memoryview:
-        self.plain = False
-        return framed(value)
-
-
 def _nothing() -> None:
     """What it prints is not followed."""
 
@@ -346,10 +334,8 @@ def open_jail(
     client: WorkerConnection, request: m.OpenJail, limits: WireLimits, deadline: Deadline
 ) -> JailHandle:
     """Open a jail.
-
-    Raises:
-        SandboxUnavailableError: A layer of the confinement is missing.
-        WorkerDiedError: It did not come up.
+    Raises ``SandboxUnavailableError``: a layer of the confinement is missing; ``WorkerDiedError``:
+    it did not come up.
     """
     sent = client.send(request)
     try:
@@ -378,10 +364,8 @@ def _end_unseen(client: WorkerConnection, sent: int) -> None:
 def _runners(opened: m.JailOpened, count: int) -> list[int]:
     """The numbers of as many runners as were asked for."""
     runners = list(opened.runners)
-    if (
-        not all(type(runner) is int for runner in runners)
-        or not len(set(runners)) == len(runners) == count
-    ):
+    are_numbers = all(type(runner) is int for runner in runners)
+    if not are_numbers or not len(set(runners)) == len(runners) == count:
         raise RemoteProtocolError(f"the worker did not start {count} runners, each with a number")
     return runners
 
@@ -418,9 +402,7 @@ class WatchedAttributes:
 
     def take(self, frames: Sequence[Buffer]) -> Sequence[Buffer]:
         """A reply's own frames, without the changes in front. Trust: input from the worker.
-
-        Raises:
-            RemoteProtocolError: These are not what was agreed on.
+        Raises ``RemoteProtocolError``: these are not what was agreed on.
         """
         if len(frames) >= DEFAULT_LIMITS.frames:  # there was no room in front
             self.forget()

@@ -13,6 +13,7 @@ import re
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -71,25 +72,16 @@ class Lines:
             sink(text)
 
 
-class BoundedSink:
-    """Takes lines, up to a number of bytes.
+def bounded_sink(write: Sink, left: int) -> Sink:
+    """What writes each line, until ``left`` bytes are written; then it says once that it stops."""
 
-    Args:
-        write: Where the text goes.
-        left: How many bytes.
-    """
+    def sink(line: str) -> None:
+        nonlocal left
+        if left > 0:
+            left -= len(line.encode("utf-8", "backslashreplace")) + 1
+            write(f"{line}\n" if left > 0 else "[the rest is left out]\n")
 
-    def __init__(self, write: Sink, left: int) -> None:
-        self._write = write
-        self._left = left
-
-    def __call__(self, line: str) -> None:
-        """Write a line, or say once that there is no room for more."""
-        if self._left <= 0:
-            return
-        size = len(line.encode("utf-8", "backslashreplace")) + 1
-        self._left -= size
-        self._write(f"{line}\n" if self._left > 0 else "[the rest is left out]\n")
+    return sink
 
 
 class OutputSinks:
@@ -99,22 +91,20 @@ class OutputSinks:
         label: What the log calls the jail.
         path: The file, or None; it gets ``FILE_BYTES``, with what is in it.
         stderr: Whether this program's stderr gets them, ``FILE_BYTES`` of them.
-
-    Raises:
-        PolicyError: The file cannot be written.
+    Raises ``PolicyError``: the file cannot be written.
     """
 
     def __init__(self, label: str, path: Path | None, *, stderr: bool = False) -> None:
-        self.sinks: list[Sink] = [BoundedSink(_write_to_stderr, FILE_BYTES)] if stderr else []
+        self.sinks: list[Sink] = [bounded_sink(_write_to_stderr, FILE_BYTES)] if stderr else []
         self._file: TextIO | None = None
         if path is not None:
             try:
                 self._file = open(path, "a", encoding="utf-8", buffering=1)  # noqa: SIM115
             except OSError as error:
                 raise PolicyError(f"policy: output {str(path)!r}: {error}") from error
-            self.sinks.append(BoundedSink(self._file.write, FILE_BYTES - self._file.tell()))
+            self.sinks.append(bounded_sink(self._file.write, FILE_BYTES - self._file.tell()))
         if OUTPUT.isEnabledFor(logging.DEBUG):
-            self.sinks.append(lambda line: OUTPUT.debug("%s: %s", label, line))
+            self.sinks.append(partial(OUTPUT.debug, "%s: %s", label))
 
     def close(self) -> None:
         """Close the file."""
