@@ -237,9 +237,7 @@ def rollout(
             allows.
         max_steps: Vector steps after which to give up; None for no bound.
         observe: Called after the reset and after every step.
-
-    Raises:
-        RolloutError: The environment's answers cannot be counted, or its space is unknown.
+    Raises ``RolloutError``: the environment's answers cannot be counted, or its space is unknown.
     """
     counter = EpisodeCounter(env.num_envs, episodes, autoreset_mode(env))
     result = Rollout(episodes=counter.counted)

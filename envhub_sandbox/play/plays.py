@@ -98,9 +98,7 @@ def frame_of(env: Any) -> Frame:
 
 def first_frame(rendered: Any, render_mode: str | None) -> Frame:
     """The first sub-environment's frame: uint8 ``(height, width, 3)``, both sides even.
-
-    Raises:
-        VideoError: There is no such frame. Trust: input from the worker.
+    Raises ``VideoError``: there is no such frame. Trust: input from the worker.
     """
     frame = rendered
     batched = isinstance(rendered, (tuple, list)) or getattr(rendered, "ndim", 0) == 4

@@ -303,10 +303,8 @@ class ServerHold:
     than an idle server is kept. Nor does it wait for each jail's end: that takes some 20 ms, for
     the kernel has to take memory and mounts away. So closing one environment of several only asks
     for the end, and who closes the next one waits for it, or who closes the last.
-
-    Args:
-        on_enter: Called when there is one environment more.
-        on_empty: Called when the last one is closed; where that is interrupted, again.
+    ``on_enter``: called when there is one environment more.
+    ``on_empty``: called when the last one is closed; where that is interrupted, again.
     """
 
     def __init__(

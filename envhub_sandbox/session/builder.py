@@ -34,11 +34,8 @@ _numbers = itertools.count(1)
 
 class JailSource:
     """Gives each environment a jail of its own, and takes it back.
-
-    Args:
-        forget_manifest: Drops the remembered manifest, when a jail contradicts it.
-        expected: What such a jail is going to be.
-
+    ``forget_manifest``: drops the remembered manifest, when a jail contradicts it.
+    ``expected``: what such a jail is going to be.
     ``shared``: whether several environments live in one jail.
     """
 

@@ -215,12 +215,10 @@ class SuitePrewarm:
 
     Thread-safe. Each task is started in a thread of its own, so that where starting takes longer
     than playing, the next start begins while a request waits for the one before it.
-
-    Args:
-        suites: The tasks of each suite, in order.
-        count: How many tasks after the last one are started ahead, and so how many unused jails
-            there are at most. None: one, once tasks are seen to be closed before the next is used;
-            so a use of just one task, or of all at once, starts nothing ahead.
+    ``suites``: the tasks of each suite, in order.
+    ``count``: how many tasks after the last one are started ahead, and so how many unused jails
+    there are at most. None: one, once tasks are seen to be closed before the next is used; so a use
+    of just one task, or of all at once, starts nothing ahead.
     """
 
     def __init__(self, suites: Sequence[Sequence[TaskPrewarm]], count: int | None) -> None:

@@ -233,9 +233,7 @@ def own_cpus() -> list[int]:
 
 class Cores:
     """The cores of one environment's shards.
-
-    Args:
-        shards: How many there are.
+    ``shards``: how many there are.
 
     Attributes:
         awake: How many of them, the first ones, get a core that is not the client's.

@@ -54,9 +54,7 @@ class RemoteWarnings:
 
     def take(self, frames: Sequence[Buffer]) -> Sequence[Buffer]:
         """A reply's own frames, without the warnings in front. Trust: input from the worker.
-
-        Raises:
-            RemoteProtocolError: These are not what was agreed on.
+        Raises ``RemoteProtocolError``: these are not what was agreed on.
         """
         warnings, rest = WARNINGS.read(frames)
         for warning in warnings:
@@ -77,9 +75,8 @@ class RemoteWarnings:
 
     def show(self, label: str) -> None:
         """Show those that are new, with the line of the caller's own code.
-
-        Raises:
-            RemoteEnvWarning: A filter of the caller's says so. The rest is shown the next time.
+        Raises ``RemoteEnvWarning``: a filter of the caller's says so. The rest is shown the next
+        time.
         """
         while self.unshown:
             try:

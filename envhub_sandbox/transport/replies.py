@@ -67,11 +67,8 @@ class RunnersDiedError(WorkerDiedError):
 
 def expect_reply(reply: m.Message, kind: type[m.M]) -> m.M:
     """The reply, if it is of the kind that the request asks for.
-
-    Raises:
-        SandboxUnavailableError: A layer of the confinement is missing.
-        WorkerDiedError: A process of the jail ended.
-        RemoteProtocolError: It is another message.
+    Raises ``SandboxUnavailableError``: a layer of the confinement is missing; ``WorkerDiedError``:
+    a process of the jail ended; ``RemoteProtocolError``: it is another message.
     """
     if isinstance(reply, m.Refusal) and kind is not m.Refusal:
         raise refusal(reply)
@@ -82,10 +79,8 @@ def expect_reply(reply: m.Message, kind: type[m.M]) -> m.M:
 
 def check_reply(reply: m.Message) -> None:
     """Raise what a runner's reply says went wrong.
-
-    Raises:
-        EnvHubError: What the repository raised.
-        RemoteProtocolError: A runner spoke in the server's name.
+    Raises ``EnvHubError``: what the repository raised; ``RemoteProtocolError``: a runner spoke in
+    the server's name.
     """
     if isinstance(reply, m.RaisedException):
         raise raised(reply)
@@ -95,9 +90,7 @@ def check_reply(reply: m.Message) -> None:
 
 def typed_reply(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.M:
     """The reply, if it is of the kind, or of one of the kinds, that the request asks for.
-
-    Raises:
-        RemoteProtocolError: It is another message.
+    Raises ``RemoteProtocolError``: it is another message.
     """
     if isinstance(reply, kind):
         return reply

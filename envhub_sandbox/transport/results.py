@@ -26,10 +26,8 @@ Own = tuple[list[list[dict[Any, Any]]], Sequence[bool], tuple[Any, ...]]
 
 class Results:
     """Joins the replies for one environment. Trust: input from the worker.
-
-    Args:
-        manifest: What the worker declared.
-        bounds: The slices of the sub-environments, in the order of the replies.
+    ``manifest``: what the worker declared.
+    ``bounds``: the slices of the sub-environments, in the order of the replies.
 
     Attributes:
         manifest, bounds: As given.
@@ -56,9 +54,8 @@ class Results:
 
     def step(self, replies: list[m.StepDone], infos: dict[Any, Any] | None = None) -> StepResult:
         """What ``VectorEnv.step`` returns; with these infos, if there are other ones.
-
-        Raises:
-            Misfit: The shards' infos do not go together; the others are what ``joined_own`` makes.
+        Raises ``Misfit``: the shards' infos do not go together; the others are what ``joined_own``
+        makes.
         """
         return (
             self._observation([reply.observation for reply in replies]),
@@ -109,9 +106,7 @@ class Results:
 
     def joined_own(self, replies: list[m.Value]) -> dict[Any, Any]:
         """One mapping of the sub-environments' own infos, joined here as Gymnasium does it.
-
-        Raises:
-            RemoteEnvError: It would raise in Gymnasium, too.
+        Raises ``RemoteEnvError``: it would raise in Gymnasium, too.
         """
         own = self.own_pairs(replies)
         forms = [form for _, _, form in own]
@@ -134,9 +129,7 @@ class Results:
         """Those infos, each with the place of its sub-environment and its forms.
 
         Trust: input from the worker.
-
-        Raises:
-            RemoteProtocolError: They are of others, or none.
+        Raises ``RemoteProtocolError``: they are of others, or none.
         """
         pairs: list[OwnInfo] = []
         start = 0
@@ -179,9 +172,7 @@ class Results:
 
     def each(self, infos: dict[Any, Any]) -> list[list[dict[Any, Any]]]:
         """Infos that came apart: each sub-environment's, in their order.
-
-        Raises:
-            RemoteEnvError: A reward is no number.
+        Raises ``RemoteEnvError``: a reward is no number.
         """
         with UNTRUSTED:
             own, _, reward = self.own(infos)
@@ -223,9 +214,7 @@ class Results:
 
     def info(self, reply: m.Message | None) -> dict[Any, Any]:
         """A shard's infos, out of what it said of them; nothing at all is none.
-
-        Raises:
-            RemoteEnvError: The environment raised.
+        Raises ``RemoteEnvError``: the environment raised.
         """
         if reply is None:
             return {}
@@ -287,10 +276,8 @@ def _own_infos(value: Any, size: int) -> Sequence[OwnInfo]:
 
 def all_replies(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:
     """The shards' replies, all of the kind, or of one of the kinds, that was asked for.
-
-    Raises:
-        EnvHubError: What the repository raised; that comes before a wrong message of another shard.
-        RemoteProtocolError: A message is another one.
+    Raises ``EnvHubError``: what the repository raised; that comes before a wrong message of another
+    shard; ``RemoteProtocolError``: a message is another one.
     """
     others = [reply for reply in replies if type(reply) is not kind]
     for reply in others:

@@ -41,10 +41,8 @@ Bounds = list[tuple[int, int]]
 
 class ShardTrials:
     """How long the steps of the environments of one manifest took, in a file beside it.
-
-    Args:
-        path: The file, or None for what must not be remembered.
-        apart: Whether sub-environments that seemed to be independent were found not to be.
+    ``path``: the file, or None for what must not be remembered.
+    ``apart``: whether sub-environments that seemed to be independent were found not to be.
     """
 
     def __init__(self, path: Path | None, *, apart: bool = False) -> None:
@@ -54,10 +52,8 @@ class ShardTrials:
 
     def bounds_for(self, env: EnvManifest, num_workers: int | None) -> Bounds:
         """The slices of the sub-environments, one for each shard.
-
-        Args:
-            env: What the environment is.
-            num_workers: As many shards, if they can be had; None for as many as are useful.
+        ``env``: what the environment is.
+        ``num_workers``: as many shards, if they can be had; None for as many as are useful.
         """
         if not env.shardable or (num_workers is None and env.sync):
             return even_bounds(env.num_envs, 1)

@@ -43,17 +43,13 @@ class SeedError(TypeError, Error):
 @singledispatch
 def batch_of(space: gym.Space[Any], value: Any, count: int | None, where: str = "actions") -> Any:
     """A batch of ``count`` members of a *single* action space.
-
-    Args:
-        count: None where the space is that of the whole batch.
-        where: What to call it in an error.
+    ``count``: none where the space is that of the whole batch.
+    ``where``: what to call it in an error.
 
     Returns:
         Arrays of shape ``(count, *space.shape)``, in dicts and tuples as the space has them; in
         place of an array, a list of so many numbers of Python, or of lists of them.
-
-    Raises:
-        ActionError: A wrong shape, dtype or structure.
+    Raises ``ActionError``: a wrong shape, dtype or structure.
     """
     if count is None:
         return value

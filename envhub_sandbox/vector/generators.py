@@ -61,9 +61,7 @@ _UNKEPT = _Live(np.random.Generator(np.random.PCG64(0)), 0).references()
 
 class Generators:
     """The generators of a vector environment: one of each sub-environment, or its own one.
-
-    Args:
-        requests: Those of the vector environment.
+    ``requests``: those of the vector environment.
 
     Attributes:
         single: Whether there is but one, of a repository's own class; known once it was read.
@@ -85,9 +83,7 @@ class Generators:
 
     def put(self, index: int, value: Any) -> None:
         """Make this the generator of a sub-environment, as ``env.np_random = value`` does.
-
-        Raises:
-            TypeError: Its state cannot be sent.
+        Raises ``TypeError``: its state cannot be sent.
         """
         bits: Any = getattr(value, "bit_generator", None)
         if not isinstance(value, np.random.Generator) or type(bits) not in BIT_GENERATORS:
@@ -104,9 +100,7 @@ class Generators:
 
     def write(self, states: Sequence[Any], *, new: bool = False) -> None:
         """Send states to the generators in the jail; None leaves one as it is.
-
-        Args:
-            new: Whether each is another generator, and not the same one after some draws.
+        ``new``: whether each is another generator, and not the same one after some draws.
         """
 
         def message(number: int, bounds: tuple[int, int]) -> m.Message:

@@ -69,9 +69,7 @@ class SubEnvironment(gym.Env[Any, Any]):
     @short_traceback
     def close(self) -> None:
         """Close it, if there are no others.
-
-        Raises:
-            ValueError: There are, and a vector environment cannot go on without one of them.
+        Raises ``ValueError``: there are, and a vector environment cannot go on without one of them.
         """
         if self._vector.num_envs > 1:
             raise ValueError(
@@ -91,10 +89,8 @@ class SubEnvironment(gym.Env[Any, Any]):
     @short_traceback
     def env(self) -> Any:
         """What this wrapper wraps.
-
-        Raises:
-            AttributeError: It is no wrapper.
-            RemoteProtocolError: There is no end to them.
+        Raises ``AttributeError``: it is no wrapper; ``RemoteProtocolError``: there is no end to
+        them.
         """
         if self._depth is not None and self._depth >= _MOST_WRAPPERS:
             raise RemoteProtocolError(f"the worker says that more than {_MOST_WRAPPERS} wrap one")

@@ -72,9 +72,8 @@ def steps_for(
         metadata: The environment's. Trust: the worker's words.
         keys: ``state_keys`` and ``camera_keys`` of a caller who chooses, as IsaaclabArenaEnv takes
             them.
-
-    Raises:
-        ValueError: The repository names a step that it may not name, or that is not so configured.
+    Raises ``ValueError``: the repository names a step that it may not name, or that is not so
+    configured.
     """
     if metadata.get(DECLARED) is not None:
         return [*_declared(metadata[DECLARED])]

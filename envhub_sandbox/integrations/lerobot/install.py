@@ -29,13 +29,9 @@ def install(**options: Any) -> None:
 
     That holds for references and for every ``HubEnvConfig``. ``trust_remote_code`` is neither
     needed nor heeded. A later call replaces the options of an earlier one.
-
-    Args:
-        options: ``envhub_sandbox.make_env``'s, for all repositories.
-
-    Raises:
-        TypeError: An option that it does not have.
-        RuntimeError: This LeRobot loads repositories in another way than is known here.
+    ``options``: ``envhub_sandbox.make_env``'s, for all repositories.
+    Raises ``TypeError``: an option that it does not have; ``RuntimeError``: this LeRobot loads
+    repositories in another way than is known here.
     """
     known = [key for key, one in OPTIONS.items() if not one.field and key not in _GIVEN]
     unknown = [name for name in options if name not in known]

@@ -75,10 +75,8 @@ class InFlight:
 
     Used by one thread at a time. A ``close`` may come from another: a wait holds the locks of the
     workers that it waits for, so it is ended as any request is (interruption.md, rule 11).
-
-    Args:
-        order: The environment's requests.
-        parts: The session of each worker, in the order of their sub-environments.
+    ``order``: the environment's requests.
+    ``parts``: the session of each worker, in the order of their sub-environments.
     """
 
     def __init__(self, order: RequestOrder, parts: Sequence[EnvSession]) -> None:
