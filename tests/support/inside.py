@@ -343,8 +343,8 @@ DECODING: Spot = (message, "_checked")
 """What makes a message of a decoded document that has no form yet."""
 MAY_SPIN: Spot = (served_slabs, "_MAY_SPIN")
 """Whether a server and a runner wait awake for one another on this machine."""
-FORMS: tuple[Spot, Spot] = ((message, "_OUTGOING"), (message, "_INCOMING"))
-"""What is remembered of the shape of messages, each way."""
+FORMS: Spot = message, "_INCOMING"
+"""What is kept of messages that were received."""
 CHECK_OF_WARNINGS: Spot = (prefix.WARNINGS, "_check")
 """What looks at each warning of a worker's."""
 CONTAINERS: Spot = (container, "_POOL")
@@ -384,11 +384,9 @@ def sending(connection: WorkerConnection) -> Spot:
 # --- one module at a time ----------------------------------------------------------------------
 
 
-def forms(spot: Spot) -> dict[Any, Any]:
-    """What one of the ``FORMS`` remembers now."""
-    owner, name = spot
-    found: dict[Any, Any] = getattr(owner, name)._forms
-    return found
+def forms() -> dict[Any, Any]:
+    """What is kept of received messages now."""
+    return message._INCOMING._forms
 
 
 def living(ledger: Ledger) -> Any:

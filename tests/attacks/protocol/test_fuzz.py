@@ -132,8 +132,7 @@ def test_a_memory_that_fails_is_noticed(
     recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert first_wrong(recorded, "unpack") == ""
-    for spot in inside.FORMS:
-        monkeypatch.setattr(*spot, message.Forms())
+    monkeypatch.setattr(*inside.FORMS, message.Forms())
     monkeypatch.setattr(message, "Incoming", Forgetful)
     assert first_wrong(recorded, "unpack") == "another message"
 

@@ -31,7 +31,7 @@ TEXT = st.characters(exclude_categories=["Cs"], exclude_characters="\0")
 
 def through(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     writer = ArrayWriter()
-    descriptor = writer.add(array)
+    descriptor = writer.add(array).data
     reader = ArrayReader(b"".join(writer.tail), writer.frames, DEFAULT_LIMITS)
     read = reader.take(descriptor)
     reader.finish()

@@ -1,6 +1,6 @@
 """Frames of a message, and the number in front of a header.
 
-Messages that recur are packed and unpacked by their form: nobody may notice.
+Messages that recur are unpacked by their form: nobody may notice.
 """
 
 from __future__ import annotations
@@ -33,13 +33,10 @@ from tests.support.compare import assert_same
 from tests.support.decode import decode
 from tests.support.values import values
 
-OUTGOING, INCOMING = inside.FORMS
-
 
 @pytest.fixture(autouse=True)
 def no_forms(monkeypatch: pytest.MonkeyPatch) -> None:
-    for spot in (OUTGOING, INCOMING):
-        monkeypatch.setattr(*spot, message.Forms())
+    monkeypatch.setattr(*inside.FORMS, message.Forms())
 
 
 def changed(value: Any) -> Any:
@@ -73,7 +70,7 @@ def test_what_is_equal_and_not_the_same_is_kept_apart(one: Any, other: Any) -> N
         message = m.unpack(m.pack(m.Value((value,))))
         assert isinstance(message, m.Value)
         assert_same((value,), message.value)
-    assert inside.forms(INCOMING)
+    assert inside.forms()
 
 
 MAPPED = RemoteEnum("a.E", "MAPPED", {"x": [1]})
@@ -97,9 +94,8 @@ def test_keys_that_are_no_text_recur(key: object) -> None:
 
 
 def test_a_form_that_cannot_be_made_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For whatever reason: what was packed and unpacked without one is so again."""
-    for name in ("Outgoing", "Incoming"):
-        monkeypatch.setattr(message, name, Mock(side_effect=RuntimeError))
+    """For whatever reason: what was unpacked without one is so again."""
+    monkeypatch.setattr(message, "Incoming", Mock(side_effect=RuntimeError))
     for _ in range(5):
         assert m.unpack(m.pack(m.Value({"a": 1}))) == m.Value({"a": 1})
 
@@ -118,7 +114,7 @@ def _known(value: object) -> bytes:
     for _ in range(3):
         frames = m.pack(m.Value(value))
         m.unpack(frames)
-    assert inside.forms(INCOMING)
+    assert inside.forms()
     [header] = frames
     return bytes(header)
 
@@ -178,8 +174,7 @@ class _Own:
 def test_a_peer_that_never_repeats_itself_fills_nothing() -> None:
     for number in range(2000):
         m.unpack(m.pack(m.Value(f"{number}")))
-    assert not inside.forms(INCOMING)
-    assert len(inside.forms(OUTGOING)) == 1  # that of a text
+    assert not inside.forms()
 
 
 @pytest.mark.parametrize(
@@ -205,7 +200,7 @@ def test_a_form_keeps_no_array() -> None:
         lent = m.unpack([bytes(header), memoryview(lender)], borrows=True)
         assert sys.getrefcount(lender) > unheld
         del lent
-    assert inside.forms(INCOMING)
+    assert inside.forms()
     assert sys.getrefcount(lender) == unheld
 
 

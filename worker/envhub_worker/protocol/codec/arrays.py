@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import struct
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -54,8 +54,6 @@ _CODES = {
     char: _DTYPES.index(np.dtype(char)) for char in "?bBhHiIlLqQefdFD" if np.dtype(char) in _DTYPES
 }
 """By the character of a dtype: "l" and "q" are the same integer on most platforms."""
-_SCALAR_CODES = {np.dtype(char).type: bytes((code,)) for char, code in _CODES.items()}
-_NUMBERS = frozenset(_SCALAR_CODES)
 
 
 class ArrayWriter:
@@ -74,32 +72,20 @@ class ArrayWriter:
         self.frames: list[memoryview] = []
         self._tail_bytes = 0
 
-    def add(self, array: Array) -> bytes:
-        """Takes an array of any layout and byte order, and returns its descriptor.
+    def add(self, array: Array) -> Any:
+        """Takes an array of any layout and byte order; returns the extension that describes it.
         Raises ``LocalProtocolError``: a dtype that is not on the list, such as void or long double.
         """
         in_tail, in_frame, plain = _descriptors(array.dtype, array.shape)
         if not plain:
             array = native(array)
-        if _has_room(array.nbytes, self._tail_bytes):
+        nbytes = array.nbytes
+        if nbytes <= INLINE_BYTES and self._tail_bytes + nbytes <= MAX_TAIL_BYTES:
             self.tail.append(array.tobytes())
-            self._tail_bytes += array.nbytes
+            self._tail_bytes += nbytes
             return in_tail
         self.frames.append(raw(array))
         return in_frame
-
-
-def _has_room(nbytes: int, tail_bytes: int) -> bool:
-    return nbytes <= INLINE_BYTES and tail_bytes + nbytes <= MAX_TAIL_BYTES
-
-
-def in_tail(sizes: Sequence[int]) -> list[bool]:
-    """Which of some arrays, in their order, ``ArrayWriter`` puts into the tail."""
-    found, tail_bytes = [], 0
-    for nbytes in sizes:
-        found.append(_has_room(nbytes, tail_bytes))
-        tail_bytes += nbytes * found[-1]
-    return found
 
 
 class ArrayReader:
@@ -218,15 +204,15 @@ def parse_descriptor(descriptor: bytes) -> tuple[np.dtype[Any], tuple[int, ...],
 
 
 @lru_cache(maxsize=1024)
-def _descriptors(dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[bytes, bytes, bool]:
-    """Returns the descriptors for tail and frame, and whether the bytes travel as they are."""
+def _descriptors(dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[Any, Any, bool]:
+    """The extensions for tail and for frame, and whether the bytes travel as they are."""
     plain = dtype.isnative and dtype.kind not in "US"
     # numpy's empty strings have no width; they travel as one character.
     head = describe_dtype(dtype if dtype.itemsize else np.dtype((dtype.kind, 1)))
     sizes = pack_shape(shape)
     in_tail = head[:1] + bytes((len(shape),)) + head[1:] + sizes
     in_frame = head[:1] + bytes((len(shape) | _OWN_FRAME,)) + head[1:] + sizes
-    return in_tail, in_frame, plain
+    return msgpack.ExtType(wire.ARRAY, in_tail), msgpack.ExtType(wire.ARRAY, in_frame), plain
 
 
 def pack_shape(shape: tuple[int, ...]) -> bytes:
@@ -339,7 +325,7 @@ def _write_array(encoder: Encoder, array: Array) -> object:
     if array.dtype.char in _WIDEST and encoder.pickler is None:
         array = array.astype(_WIDEST[array.dtype.char])
     if array.dtype.kind not in ("O" if encoder.pickler else "OV"):
-        return msgpack.ExtType(wire.ARRAY, encoder.array(array))
+        return encoder.array(array)
     return [msgpack.ExtType(wire.OBJECTS, pack_shape(array.shape)), *array.ravel().tolist()]
 
 
@@ -359,25 +345,22 @@ def _write_text_scalar(encoder: Encoder, value: np.str_ | np.bytes_) -> object:
     return [msgpack.ExtType(wire.TEXT_SCALAR, b""), plain]
 
 
+_TENSOR_HEADS = {name: msgpack.ExtType(wire.TENSOR, name.encode()) for name in wire.TENSOR_DTYPES}
+
+
 def _write_tensor(encoder: Encoder, tensor: Any) -> object:
-    name, array = _bits(tensor)
-    if array is None:
-        return encoder.unknown(tensor)
-    return [msgpack.ExtType(wire.TENSOR, name.encode()), array]
-
-
-def _bits(tensor: Any) -> tuple[str, Array | None]:
-    """Torch's name of a tensor's dtype, and its bits; None where it has no form."""
+    """The bits, under torch's name of their dtype."""
     name, strided = _tensor_form(tensor.dtype, tensor.layout)
     if not strided or name not in wire.TENSOR_DTYPES:
-        return name, None
+        return encoder.unknown(tensor)
     try:
-        return name, tensor.numpy()
+        array = tensor.numpy()
     except (RuntimeError, TypeError):  # it has a gradient, lies elsewhere, or is a view of a kind
         plain = tensor.detach().cpu().resolve_conj().resolve_neg()
         if name == "bfloat16":
             plain = plain.view(sys.modules["torch"].int16)
-        return name, plain.numpy().view(wire.TENSOR_DTYPES[name])
+        array = plain.numpy().view(wire.TENSOR_DTYPES[name])
+    return [_TENSOR_HEADS[name], encoder.array(array)]
 
 
 @lru_cache(maxsize=64)
@@ -386,43 +369,11 @@ def _tensor_form(dtype: Any, layout: Any) -> tuple[str, bool]:
     return str(dtype).rpartition(".")[2], str(layout) == "torch.strided"
 
 
-def outlined(value: Any) -> tuple[Any, Array | None]:
-    """All that the descriptor of an array of numbers or of a tensor depends on, and the array; of a
-    scalar of numpy's, its class.
-    """
-    kind = type(value)
-    if kind is np.ndarray and value.dtype.char in _CODES and value.dtype.isnative:
-        return (kind, value.dtype.char, value.shape), value
-    if kind in _NUMBERS:
-        return kind, None
-    if kind is getattr(sys.modules.get("torch"), "Tensor", None):
-        name, array = _bits(value)
-        if array is not None:
-            return (kind, name, array.shape), array
-    return None, None
-
-
-def written(value: Any, in_tail: Iterator[bool]) -> bytes | None:
-    """The piece of a document for a value that is ``outlined``; None for a scalar."""
-    kind = type(value)
-    if kind in _NUMBERS:
-        return None
-    head, array = b"", value
-    if kind is not np.ndarray:
-        name, array = _bits(value)
-        tensor_head = msgpack.ExtType(wire.TENSOR, name.encode())
-        head = msgpack.Packer().pack_array_header(2) + msgpack.packb(tensor_head)
-    described = _descriptors(array.dtype, array.shape)[0 if next(in_tail) else 1]
-    return bytes(head + msgpack.packb(msgpack.ExtType(wire.ARRAY, described)))
-
-
-def scalar(value: np.generic) -> Any:
-    """What msgpack packs for a scalar of numpy's that is ``outlined``."""
-    return msgpack.ExtType(wire.SCALAR, _SCALAR_CODES[type(value)] + value.tobytes())
-
-
 def write_numpy(encoder: Encoder, value: Any) -> object:
     """The form of a subclass, or of another library's array; NotImplemented of all else."""
+    torch = sys.modules.get("torch")
+    if torch is not None and isinstance(value, getattr(torch, "Tensor", ())):
+        return _write_tensor(encoder, value)
     if isinstance(value, (np.str_, np.bytes_)):
         return _write_text_scalar(encoder, value)
     if isinstance(value, np.generic):
@@ -431,9 +382,6 @@ def write_numpy(encoder: Encoder, value: Any) -> object:
         return encoder.unknown(value)
     if isinstance(value, np.ndarray):
         return _write_array(encoder, np.asarray(value))
-    torch = sys.modules.get("torch")
-    if torch is not None and isinstance(value, getattr(torch, "Tensor", ())):
-        return _write_tensor(encoder, value)
     if hasattr(type(value), "__array__") and hasattr(type(value), "__dlpack__"):
         array = np.asarray(value)
         widened = array.astype(np.float32) if array.dtype.name == "bfloat16" else array

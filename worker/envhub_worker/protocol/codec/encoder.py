@@ -61,8 +61,8 @@ class Encoder:
         """Returns what msgpack packs in place of ``value``."""
         return _WRITERS.get(type(value), _write_other)(self, value)
 
-    def array(self, array: Array) -> bytes:
-        """Takes the bytes of an array; returns its descriptor."""
+    def array(self, array: Array) -> Any:
+        """Takes the bytes of an array; returns the extension that describes it."""
         if self._writer is None:
             from envhub_worker.protocol.codec.arrays import ArrayWriter
 
@@ -101,7 +101,8 @@ def _write_pickled(encoder: Encoder, pickled: PickledValue) -> object:
         return msgpack.ExtType(wire.PICKLE, data)
     import numpy as np
 
-    return msgpack.ExtType(wire.PICKLE_FRAME, encoder.array(np.frombuffer(data, np.uint8)))
+    described = encoder.array(np.frombuffer(data, np.uint8))
+    return msgpack.ExtType(wire.PICKLE_FRAME, described.data)
 
 
 def _write_other(encoder: Encoder, value: Any) -> object:
@@ -167,11 +168,11 @@ _BASES = (int, tuple, complex, set, frozenset)
 
 def encode(
     value: object,
-    *,
     pickler: Pickler | None = None,
     limits: WireLimits = DEFAULT_LIMITS,
     names: Sequence[str] = (),
     describer: Describer | None = None,
+    *,
     reduces: bool = False,
 ) -> list[Buffer]:
     """Encodes a value as frames: the header, then one per large array.

@@ -1,69 +1,50 @@
-"""What the codec has made of a message, kept for the next one of the same outline.
+"""What the codec has made of a received message, kept for the next one of the same document.
 
-What recurs, such as steps, calls and what a server is asked, is encoded and decoded once: what the
-codec has made of a document is kept, when it is met again, as a *form*. The key is the whole
-document, or all that it depends on but scalars, so a form says exactly what the codec would say.
-The bytes of arrays are no part of a document: they are new each time, and are checked each time.
-Forms are few and small: a peer that sends nothing twice gains nothing and costs nothing.
+Steps, calls and requests to a server recur. When a document comes for the second time, what the
+codec makes of it is kept as a *form*, by the whole document: so a form says exactly what the codec
+would say. The bytes of arrays are no part of a document: they are read and checked each time.
 """
 
 from __future__ import annotations
 
-import contextlib
-import itertools
-import struct
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
-
-import msgpack  # type: ignore[import-untyped]
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker
-from envhub_worker.protocol.codec.wire import DOCUMENT_BYTES, TUPLE, Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits
 
 if TYPE_CHECKING:
     from envhub_worker.protocol.codec.arrays import Array
+    from envhub_worker.protocol.messages.message import Message
 
 MAX_DOCUMENT_BYTES = 1024
 _MAX_FORMS = 256
-_MAX_ITEMS = 32
-_MAX_TEXT = 256
-_SCALARS = frozenset({float, int, bool, str})
-_CONSTANTS = frozenset({bytes, type(None)})
-_FLOAT = struct.Struct(">Bd")
-
-_TUPLE_HEAD = msgpack.ExtType(TUPLE, b"")
-
-K = TypeVar("K")
-F = TypeVar("F")
-Make = Callable[[list[Any]], Any]
-"""Makes a value of the arrays of its message."""
+_CONSTANTS = frozenset({float, int, bool, str, bytes, type(None)})
 
 
-class Forms(Generic[K, F]):
-    """Forms by key; one is made when its key is met for the second time.
+class Forms:
+    """Forms by document; one is made when its document comes for the second time.
 
-    Until then there is no more of a key than its hash: most keys of a server come once, with the
-    number of a jail or a time in them, and some are large. Two keys of one hash only get forms
-    earlier, for a form is kept under the whole key.
+    Until then only a hash is kept: most documents that a server reads come once, with the number of
+    a jail or a time in them. Two documents of one hash only get their forms earlier.
     """
 
     def __init__(self) -> None:
-        self._forms: dict[K, F] = {}
+        self._forms: dict[bytes, Incoming] = {}
         self._once: set[int] = set()
         self.get = self._forms.get
 
-    def met(self, key: K, make: Callable[[], F]) -> None:
-        """Take note of a key that has no form, or none that holds.
+    def met(self, document: bytes, make: Callable[[], Incoming]) -> None:
+        """Take note of a document that has no form, or none for these limits.
 
         The codec has already made the message. So if ``make`` fails, for whatever reason, there is
-        no form, and the codec makes the next message of this key too.
+        no form, and the codec makes the next message of this document too.
         """
-        hashed = hash(key)
-        if hashed not in self._once and key not in self._forms:
+        hashed = hash(document)
+        if hashed not in self._once and document not in self._forms:
             if len(self._once) >= _MAX_FORMS:
                 self._once.clear()
             self._once.add(hashed)
@@ -75,156 +56,10 @@ class Forms(Generic[K, F]):
             return
         if len(self._forms) >= _MAX_FORMS:
             self._forms.clear()
-        self._forms[key] = form
+        self._forms[document] = form
 
 
-class Outlined:
-    """What the document of some values depends on, and what of them is new each time.
-
-    Attributes:
-        key: Classes, keys and shapes; None if they hold anything but constants, scalars, arrays of
-            numbers, tensors, and small tuples, lists and dicts.
-        scalars: Numbers and short texts, in the order of the document.
-        arrays: Arrays, likewise; of tensors, their bits.
-    """
-
-    __slots__ = ("arrays", "key", "scalars")
-
-    def __init__(self, values: list[Any]) -> None:
-        self.scalars: list[Any] = []
-        self.arrays: list[Array] = []
-        self.key: tuple[Any, ...] | None = None
-        # deep or cyclic: the codec says what is wrong
-        with contextlib.suppress(IrregularError, RecursionError):
-            self.key = tuple(map(self._outlined, values))
-
-    def _outlined(self, value: Any) -> Any:
-        kind = type(value)
-        if kind in _SCALARS:
-            if (kind is str and len(value) > _MAX_TEXT) or (kind is int and not _fits(value)):
-                raise IrregularError
-            self.scalars.append(value)
-            return kind
-        if kind in _CONSTANTS:
-            if kind is bytes and len(value) > _MAX_TEXT:
-                raise IrregularError
-            return kind, value
-        if kind is dict and len(value) <= _MAX_ITEMS:
-            if set(map(type, value)) - {str}:
-                raise IrregularError
-            return kind, *[(key, self._outlined(item)) for key, item in value.items()]
-        if (kind is tuple or kind is list) and len(value) <= _MAX_ITEMS:
-            return kind, *map(self._outlined, value)
-        form, array = _codec().outlined(value) if "numpy" in sys.modules else (None, None)
-        if form is None:
-            raise IrregularError
-        if array is None:
-            self.scalars.append(value)
-        else:
-            self.arrays.append(array)
-        return form
-
-
-def _fits(value: int) -> bool:
-    return -(1 << 63) <= value < 1 << 64
-
-
-class Outgoing:
-    """The document of messages of one outline.
-
-    Args:
-        kind, values: Of one message.
-        frames: What the codec has made of it.
-        outlined: Its outline.
-        limits: For which it was encoded.
-
-    Raises:
-        IrregularError: There is no form for it: another would be encoded in another way.
-    """
-
-    __slots__ = ("_in_tail", "_pieces", "limits")
-
-    def __init__(
-        self,
-        kind: int,
-        values: list[Any],
-        frames: list[Buffer],
-        outlined: Outlined,
-        limits: WireLimits,
-    ) -> None:
-        self.limits = limits
-        sizes = [array.nbytes for array in outlined.arrays]
-        self._in_tail = _codec().in_tail(sizes) if sizes else []
-        parts: list[bytes | None] = [msgpack.Packer().pack_array_header(1 + len(values))]
-        parts.append(msgpack.packb(kind))
-        in_tail = iter(self._in_tail)
-        for value in values:
-            _write(value, in_tail, parts)
-        # None stands for a scalar; what is constant between two of them is one piece
-        self._pieces = [
-            piece
-            for is_scalar, some in itertools.groupby(parts, key=lambda part: part is None)
-            for piece in (some if is_scalar else [b"".join(filter(None, some))])
-        ]
-        document = self._document(outlined.scalars)
-        header = len(document) + sum(itertools.compress(sizes, self._in_tail))
-        made = header, self._in_tail.count(False)
-        if not bytes(frames[0]).startswith(document) or made != (len(frames[0]), len(frames) - 1):
-            raise IrregularError
-
-    def _document(self, scalars: Sequence[Any]) -> bytes:
-        new = map(_packed, scalars)
-        document = b"".join([next(new) if piece is None else piece for piece in self._pieces])
-        return DOCUMENT_BYTES.pack(len(document)) + document
-
-    def frames(self, outlined: Outlined) -> list[Buffer]:
-        """The frames of a message of the same outline.
-        Raises ``UnicodeEncodeError``: a text is none that the wire has.
-        """
-        header, frames = [self._document(outlined.scalars)], []
-        for array, in_tail in zip(outlined.arrays, self._in_tail, strict=True):
-            if in_tail:
-                header.append(array.tobytes())
-            else:
-                frames.append(_codec().raw(array))
-        return [b"".join(header), *frames]
-
-
-def _write(value: Any, in_tail: Iterator[bool], parts: list[bytes | None]) -> None:
-    """Add the document of a value that has an outline; None stands for each scalar."""
-    kind = type(value)
-    packer = msgpack.Packer(default=_unknown)
-    if kind in _SCALARS:
-        parts.append(None)
-    elif kind is dict:
-        parts.append(packer.pack_map_header(len(value)))
-        for key, item in value.items():
-            parts.append(packer.pack(key))
-            _write(item, in_tail, parts)
-    elif kind is tuple or kind is list:
-        head = packer.pack(_TUPLE_HEAD) if kind is tuple else b""
-        parts += [packer.pack_array_header(len(value) + bool(head)), head]
-        for item in value:
-            _write(item, in_tail, parts)
-    elif kind in _CONSTANTS:
-        parts.append(packer.pack(value))
-    else:
-        parts.append(_codec().written(value, in_tail))
-
-
-def _unknown(value: object) -> Any:
-    raise IrregularError
-
-
-def _packed(value: Any) -> bytes:
-    kind = type(value)
-    if kind is float:
-        return _FLOAT.pack(0xCB, value)
-    packed: bytes = msgpack.packb(value if kind in _SCALARS else _codec().scalar(value))
-    return packed
-
-
-class Incoming(Generic[F]):
+class Incoming:
     """What to make of a document that was decoded before.
 
     Args:
@@ -238,28 +73,27 @@ class Incoming(Generic[F]):
             arrays of numbers and tensors.
     """
 
-    __slots__ = ("_arrays", "_fields", "_make", "_message", "limits")
+    __slots__ = ("_codec", "_constant", "_make", "_template", "limits")
 
     def __init__(
         self,
         document: bytes,
         tail: Buffer,
         buffers: Sequence[Buffer],
-        make: Callable[..., F],
+        make: type[Message],
         limits: WireLimits,
     ) -> None:
-        self.limits = limits
-        self._make = make
+        self._make, self.limits = make, limits
         decoder = Decoder(tail, buffers, limits, None, _Tensor, borrows=True)
         notes: list[tuple[Array, bytes]] = []
         decoder.notes = notes
         value: Any = decoder.value(document)
-        self._arrays: list[tuple[Any, str | None]] = []
-        fields = value[1:]
-        self._fields = _maker(tuple(fields), iter(notes), self._arrays)
-        if len(self._arrays) != len(notes):
+        arrays = iter(notes)
+        self._template = [_template(field, arrays) for field in value[1:]]
+        if next(arrays, None) is not None:
             raise IrregularError
-        self._message = make(*fields) if self._fields is None else None
+        self._codec: Any = sys.modules["envhub_worker.protocol.codec.arrays"] if notes else None
+        self._constant = make(*value[1:]) if all(map(_is_constant, self._template)) else None
 
     def message(
         self,
@@ -268,28 +102,30 @@ class Incoming(Generic[F]):
         tensors: TensorMaker | None = None,
         *,
         borrows: bool = False,
-    ) -> F:
+    ) -> Message:
         """The message; what of it can be changed is fresh. Trust: input from the other side.
         ``borrows``: as ``ArrayReader`` has it.
         """
-        if not self._arrays and (tail or buffers):
-            raise RemoteProtocolError("The message has array bytes that nothing describes.")
-        if self._fields is None:
-            assert self._message is not None
-            return self._message
-        arrays: list[Any] = []
-        if self._arrays:
-            codec = _codec()
-            reader = codec.ArrayReader(tail, buffers, self.limits, borrows=borrows)
-            for described, tensor in self._arrays:
-                array = reader.read(*described)
-                arrays.append(array if tensor is None else codec.tensor(array, tensor, tensors))
-            reader.finish()
-        return self._make(*self._fields(arrays))
+        if self._constant is not None and not tail and not buffers:
+            return self._constant
+        codec = self._codec
+        if codec is None:
+            if tail or buffers:
+                raise RemoteProtocolError("The message has array bytes that nothing describes.")
+            return self._make(*map(_fresh, self._template))
+        reader = codec.ArrayReader(tail, buffers, self.limits, borrows=borrows)
+
+        def read(part: _Array) -> object:
+            array = reader.read(*part.described)
+            return array if part.tensor is None else codec.tensor(array, part.tensor, tensors)
+
+        fields = [_fresh(part, read) for part in self._template]
+        reader.finish()
+        return self._make(*fields)
 
 
 class IrregularError(Exception):
-    """A value, or a document, that no form can be made of."""
+    """A document that no form can be made of."""
 
 
 class _Tensor:
@@ -299,47 +135,44 @@ class _Tensor:
         self.array, self.name = array, name
 
 
-def _maker(value: Any, notes: Any, arrays: list[tuple[Any, str | None]]) -> Make | None:
-    """Makes a fresh value like this one; None where it cannot be changed.
+class _Array(NamedTuple):
+    """Stands for an array, or a tensor of this dtype, in a template: no form keeps an array."""
 
-    Args:
-        notes: The arrays of the document that have not been met yet, with what describes each.
-        arrays: To which those that are met are added, and of what a tensor is made.
+    described: tuple[Any, ...]
+    tensor: str | None
+
+
+def _template(value: Any, notes: Iterator[tuple[Array, bytes]]) -> Any:
+    """The value with an ``_Array`` for each array.
+    ``notes``: the arrays of the document that have not been met yet, and their descriptors.
     """
     kind = type(value)
-    if kind in _CONSTANTS or kind in _SCALARS:
-        return None
+    if kind in _CONSTANTS:
+        return value
     if kind is dict and not set(map(type, value)) - {str}:
-        named = [(key, *_part(item, notes, arrays)) for key, item in value.items()]
-        return lambda new: {key: make(new) if make else item for key, item, make in named}
-    if kind is not tuple and kind is not list:
-        return _array_maker(value, notes, arrays)
-    parts = [_part(item, notes, arrays) for item in value]
-    if kind is list:
-        return lambda new: [make(new) if make else item for item, make in parts]
-    if all(make is None for _, make in parts):
-        return None
-    return lambda new: tuple([make(new) if make else item for item, make in parts])
+        return {key: _template(item, notes) for key, item in value.items()}
+    if kind is tuple or kind is list:
+        return kind([_template(item, notes) for item in value])
+    from envhub_worker.protocol.codec.arrays import parse_descriptor
 
-
-def _part(item: Any, notes: Any, arrays: list[tuple[Any, str | None]]) -> tuple[Any, Make | None]:
-    """A constant and None, or None and a maker of fresh values: no form keeps an array."""
-    make = _maker(item, notes, arrays)
-    return (item if make is None else None), make
-
-
-def _array_maker(value: Any, notes: Any, arrays: list[tuple[Any, str | None]]) -> Make:
-    name = value.name if type(value) is _Tensor else None
+    own, tensor = (value.array, value.name) if kind is _Tensor else (value, None)
     array, descriptor = next(notes, (None, b""))
-    if array is None or array is not (value if name is None else value.array):
+    if array is None or array is not own:
         raise IrregularError
-    index = len(arrays)
-    arrays.append((_codec().parse_descriptor(descriptor), name))
-    return lambda new: new[index]
+    return _Array(parse_descriptor(descriptor), tensor)
 
 
-@cache
-def _codec() -> Any:
-    from envhub_worker.protocol.codec import arrays
+def _is_constant(part: Any) -> bool:
+    return type(part) in _CONSTANTS or (type(part) is tuple and all(map(_is_constant, part)))
 
-    return arrays
+
+def _fresh(part: Any, read: Callable[[_Array], object] | None = None) -> Any:
+    """A value of this template. ``read`` is called in the order of the document."""
+    kind = type(part)
+    if kind in _CONSTANTS:
+        return part
+    if kind is _Array and read is not None:
+        return read(part)
+    if kind is dict:
+        return {key: _fresh(item, read) for key, item in part.items()}
+    return kind([_fresh(item, read) for item in part])

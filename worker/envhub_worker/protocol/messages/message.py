@@ -11,7 +11,6 @@ that a message that recurs is the same bytes again. Packets to a runner have ids
 
 from __future__ import annotations
 
-import contextlib
 import struct
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -22,13 +21,7 @@ from envhub_worker.protocol.codec.encoder import Describer, encode
 from envhub_worker.protocol.codec.wire import DOCUMENT_BYTES, Buffer, Pickler, split_frames
 from envhub_worker.protocol.errors import UNTRUSTED, LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
-from envhub_worker.protocol.messages.forms import (
-    MAX_DOCUMENT_BYTES,
-    Forms,
-    Incoming,
-    Outgoing,
-    Outlined,
-)
+from envhub_worker.protocol.messages.forms import MAX_DOCUMENT_BYTES, Forms, Incoming
 from envhub_worker.protocol.records import About, FrozenRecord
 
 if TYPE_CHECKING:
@@ -125,8 +118,7 @@ def check_fields(cls: type[Message], values: list[object]) -> None:
 _NUMBER = struct.Struct(">Q")
 """The id in front of a header between client and server; 0 for ``CompressionHeader`` alone."""
 _MOST = (1 << 63) - 1
-_OUTGOING: Forms[Any, Outgoing] = Forms()
-_INCOMING: Forms[bytes, Incoming[Message]] = Forms()
+_INCOMING = Forms()
 """By the document, with its length in front: the whole header, where there are no arrays."""
 
 
@@ -148,22 +140,11 @@ def pack(
     values = values_of(message)
     if pickler is not None and cls.HANDED:
         values = _handed(message, values, pickler, limits)
-    outlined = Outlined(values)
-    if outlined.key is None:
-        return _encoded(message, values, pickler, limits, describer, reduces=reduces)
-    key = cls, outlined.key
-    form = _OUTGOING.get(key)
-    if form is not None and form.limits is limits:
-        with contextlib.suppress(UnicodeEncodeError):
-            return form.frames(outlined)
+    value, names = [cls.kind, *values], ("kind", *cls.FIELDS)
     try:
-        frames = _encoded(message, values, pickler, limits)
-    except LocalProtocolError:
-        if not reduces:
-            raise
-        return _encoded(message, values, pickler, limits, describer, reduces=True)
-    _OUTGOING.met(key, lambda: Outgoing(cls.kind, values, frames, outlined, limits))
-    return frames
+        return encode(value, pickler, limits, names, describer, reduces=reduces)
+    except LocalProtocolError as error:
+        raise LocalProtocolError(f"{_asked(message)}{error}") from error.__cause__
 
 
 def _handed(
@@ -182,23 +163,6 @@ def _handed(
             text = unpicklable(name, values[index], error, pickler)
             raise LocalProtocolError(f"{_asked(message)}{text}") from error
     return sent
-
-
-def _encoded(
-    message: Message,
-    values: list[Any],
-    pickler: Pickler | None,
-    limits: WireLimits,
-    describer: Describer | None = None,
-    *,
-    reduces: bool = False,
-) -> list[Buffer]:
-    value, names = [message.kind, *values], ("kind", *message.FIELDS)
-    options: dict[str, Any] = {"describer": describer, "reduces": reduces}
-    try:
-        return encode(value, pickler=pickler, limits=limits, names=names, **options)
-    except LocalProtocolError as error:
-        raise LocalProtocolError(f"{_asked(message)}{error}") from error.__cause__
 
 
 def _asked(message: Message) -> str:
@@ -239,7 +203,7 @@ def unpack(
         return message
 
 
-def recurring(header: bytes, limits: WireLimits) -> tuple[int, Incoming[Message]] | None:
+def recurring(header: bytes, limits: WireLimits) -> tuple[int, Incoming] | None:
     """How many bytes of an unpacked header are its document, and its form, if it has one."""
     end = DOCUMENT_BYTES.size + DOCUMENT_BYTES.unpack_from(header)[0]
     form = _INCOMING.get(header[:end])

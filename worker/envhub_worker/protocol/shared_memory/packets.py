@@ -48,7 +48,7 @@ class Recurring:
 
     __slots__ = ("_buffers", "_form", "_header", "_tail", "_words", "length")
 
-    def __init__(self, frames: Sequence[Buffer], document_bytes: int, form: Incoming[Any]) -> None:
+    def __init__(self, frames: Sequence[Buffer], document_bytes: int, form: Incoming) -> None:
         lengths = _lengths(frames)
         start, *starts = _starts(lengths)
         end = start + document_bytes
