@@ -13,7 +13,7 @@ import typer
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, safe_line, say
 from envhub_sandbox.cli.shared.exits import UsageError
-from envhub_sandbox.hub.checkout import make_checkout
+from envhub_sandbox.system import extras
 
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9])?", re.ASCII)
 
@@ -41,7 +41,8 @@ def init(
     """
     name = repository_name(folder)
     _write(folder, starter(name, time.localtime().tm_year, lerobot=lerobot))
-    make_checkout(folder)
+    if make_checkout := extras.find("envhub_sandbox.extras.sources.checkout", "make_checkout"):
+        make_checkout(folder)
     shown = safe_line(str(folder) if folder.is_absolute() else f"./{folder}")
     out(shown)
     say(f"Try it: envhub run {shown}. Publish it: hf upload OWNER/{name} {shown}")

@@ -20,7 +20,7 @@ import stat
 import warnings
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from envhub_sandbox.errors import (
     PolicyError,
@@ -28,7 +28,6 @@ from envhub_sandbox.errors import (
     SnapshotError,
     SnapshotTooLargeError,
 )
-from envhub_sandbox.hub.checkout import Checkout, read_checkout
 from envhub_sandbox.hub.grammar import DEFAULT_PATH, FILE, FOLDER, local_reference
 from envhub_sandbox.hub.listing import (
     DEFAULT_LIMITS,
@@ -44,6 +43,7 @@ from envhub_sandbox.hub.listing import (
 )
 from envhub_sandbox.hub.secrets import is_home, looks_secret
 from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system import extras
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import counted
 
@@ -68,6 +68,28 @@ _CURES = {
     _SECRET: "Name the folder, with {allow}",
 }
 """Why something is left out of a snapshot, and how it comes in."""
+
+
+class Checkout(Protocol):
+    """What git would commit of a folder: see the extra ``sources.checkout``."""
+
+    @property
+    def files(self) -> frozenset[str]:
+        """The files and nested repositories that a commit of everything would hold."""
+
+    @property
+    def folders(self) -> frozenset[str]:
+        """Every folder above these."""
+
+    @property
+    def tracked(self) -> frozenset[str]:
+        """The files that git knows already."""
+
+    def tracks_below(self, folder: str) -> bool:
+        """Whether git knows a file in a folder."""
+
+    def names_in(self, folder: str) -> frozenset[str]:
+        """What the files in a folder are called."""
 
 
 class LocalFile(NamedTuple):
@@ -125,9 +147,10 @@ class LocalFolder:
     def at(cls, folder: str | Path, entry: str | None = None) -> LocalFolder:
         """The folder at a path, or of it what a file gets to see."""
         root = Path(os.path.realpath(folder))
+        read_checkout = extras.find("envhub_sandbox.extras.sources.checkout", "read_checkout")
         # a home is no repository of a file's, though some keep it in git
         is_own = entry is not None and is_home(root)
-        return cls(root, None if is_own else read_checkout(root), entry)
+        return cls(root, None if is_own or read_checkout is None else read_checkout(root), entry)
 
     @classmethod
     def of(cls, snapshot: Snapshot) -> LocalFolder:
@@ -247,8 +270,9 @@ class LocalFolder:
         return self._committed(self.checkout, self.root, "")
 
     def _of_the_file(self, entry: str) -> Iterator[LocalFile | LeftOut]:
-        from envhub_sandbox.hub.sources.own import own_files
-
+        own_files = extras.required(
+            "envhub_sandbox.extras.sources.own", "own_files", str(self), "name its folder"
+        )
         if self.checkout is None:
             own = own_files(self.root, entry, _names_below(self.root))
             for name in sorted(own):

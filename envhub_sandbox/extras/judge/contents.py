@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from envhub_sandbox.extras.judge.findings import Finding
-from envhub_sandbox.hub.sources.parsing import ImportStatement, ParsedFile
+from envhub_sandbox.extras.sources.parsing import ImportStatement, ParsedFile
 
 BEGINNING = 8192
 """Bytes that decide what kind a file is."""

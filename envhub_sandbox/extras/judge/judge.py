@@ -38,10 +38,10 @@ from envhub_sandbox.extras.packages.declared import declared
 from envhub_sandbox.extras.packages.locks.day import days_for
 from envhub_sandbox.extras.packages.packages import packages_for
 from envhub_sandbox.extras.packages.request import chosen
+from envhub_sandbox.extras.sources import parsing
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
-from envhub_sandbox.hub.sources import parsing
 from envhub_sandbox.play.confinement import Confinement, denial_findings
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import policy_from

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.errors import EnvHubError, PolicyError
-from envhub_sandbox.hub.checkout import top_of
+from envhub_sandbox.extras.sources import toml
+from envhub_sandbox.extras.sources.checkout import top_of
 from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.snapshot import is_here
-from envhub_sandbox.hub.sources import toml
 from envhub_sandbox.settings.options import in_python, nearest, use_option_names
 from envhub_sandbox.settings.policy import policy_from
 from envhub_worker.protocol.text import printable, size_text

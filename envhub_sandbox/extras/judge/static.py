@@ -25,12 +25,12 @@ from envhub_sandbox.extras.judge.findings import Finding
 from envhub_sandbox.extras.packages import interpreters
 from envhub_sandbox.extras.packages.declared import DeclaredPackages, declared
 from envhub_sandbox.extras.packages.resolution.resolve import WORKERS
-from envhub_sandbox.hub.checkout import Checkout, is_unread
+from envhub_sandbox.extras.sources import parsing
+from envhub_sandbox.extras.sources.checkout import Checkout, is_unread
+from envhub_sandbox.extras.sources.parsing import MOST_BYTES, Import, ParsedFile, imports
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.hub.local import IGNORED, REPOSITORY, LocalFolder
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.hub.sources import parsing
-from envhub_sandbox.hub.sources.parsing import MOST_BYTES, Import, ParsedFile, imports
 from envhub_worker.protocol.text import counted, printable
 
 _LONGEST = 500
@@ -151,7 +151,7 @@ def _in_place(snapshot: Snapshot) -> Iterator[Finding]:
         return
     try:
         here = LocalFolder.of(snapshot)
-        if here.checkout is None:
+        if not isinstance(here.checkout, Checkout):
             yield from _links_of_folder(here)
             if is_unread(here.root):
                 message = "git cannot say what its commit has: is it installed? Are its ids SHA-1?"

@@ -23,8 +23,8 @@ from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion, Version
 
 from envhub_sandbox.errors import DependencyError
-from envhub_sandbox.hub.sources import toml
-from envhub_sandbox.hub.sources.toml import table
+from envhub_sandbox.extras.sources import toml
+from envhub_sandbox.extras.sources.toml import table
 from envhub_sandbox.settings.options import option_name
 
 _GIT = re.compile(

@@ -1,7 +1,7 @@
 """The modules that a repository imports: what brings each, and what to do where one is missing.
 
 Which distribution brings one says its own pyproject.toml, or a table of ours,
-``hub/sources/modules.txt``; never an index: anybody may publish a package under a module's name.
+``extras/sources/modules.txt``; never an index: anybody may publish a package under a module's name.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def _of_id(text: str) -> tuple[str, str, list[str]] | None:
 def _of_module(name: str, extras: Mapping[str, WantedPackage]) -> tuple[str, str, list[str]] | None:
     from packaging.utils import canonicalize_name
 
-    from envhub_sandbox.hub.sources.parsing import of_module
+    from envhub_sandbox.extras.sources.parsing import of_module
 
     distributions = of_module(name)
     names = list(map(str, map(canonicalize_name, distributions or [name.partition(".")[0]])))
@@ -190,7 +190,7 @@ def note_missing(snapshot: Snapshot, said: str) -> bool:
 
     Trust: text from the worker. It chooses among the modules of our table, as an entry file can.
     """
-    from envhub_sandbox.hub.sources.parsing import of_module
+    from envhub_sandbox.extras.sources.parsing import of_module
 
     module = found[1][:_LONGEST] if (found := re.search(_MISSING, said)) else ""
     known = read(snapshot)
@@ -215,7 +215,7 @@ def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     with contextlib.suppress(ValueError, TypeError):
         rows = json.loads(recall(*place) or "")
         return tuple((str(name), str(file), int(line)) for name, file, line in rows)
-    from envhub_sandbox.hub.sources import parsing
+    from envhub_sandbox.extras.sources import parsing
 
     files = parsing.read(snapshot)
     found = [(one.module, one.file, one.line) for one in parsing.imports(snapshot, files)]
@@ -258,7 +258,7 @@ class MissingModule:
         return ""
 
     def _cure(self, module: str, says: DeclaredPackages | None) -> str:
-        from envhub_sandbox.hub.sources.parsing import of_module
+        from envhub_sandbox.extras.sources.parsing import of_module
 
         names = of_module(module)
         path = _path_here(module.partition(".")[0], sys.path) if module else ""

@@ -1,1 +1,1 @@
-"""Sources of snapshots beside the Hub and folders: git, the index, assets."""
+"""Snapshots of git, of the index and of assets; checkouts; Python source that is only read."""

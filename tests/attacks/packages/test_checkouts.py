@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.extras.judge.static import static
-from envhub_sandbox.hub.checkout import read_checkout
+from envhub_sandbox.extras.sources.checkout import read_checkout
 from envhub_sandbox.hub.snapshot import snapshot_named
 from tests.hub.olah_server import GitRepository
 from tests.support.packages.git_server import ran

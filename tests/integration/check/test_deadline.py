@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.extras.judge.command.deadline import DeadlineReached, deadline_alarm
-from envhub_sandbox.hub.sources import parser
+from envhub_sandbox.extras.sources import parser
 from tests.corpus.entries import Entry
 from tests.hub.stub_hub import StubHub
 from tests.support.command_line import envhub

@@ -31,8 +31,10 @@ for argument, value in asked:
     except errors.SandboxUnavailableError as error:
         print(str(error).splitlines()[0])
 """
+_FOLDER = sample("cartpole")
 _ASKED = [
     ("cfg", "pypi:minigrid#MiniGrid-Empty-5x5-v0", "a reference of pypi", "sources.registered"),
+    ("cfg", f"{_FOLDER}/env.py", f"local file {_FOLDER}/env.py", "sources.own"),
     ("sandbox", "docker", "sandbox", "docker.sandbox"),
     ("sandbox", "tcp://localhost:1", "sandbox", "remote.sandbox"),
     ("sandbox", ["process"], "sandbox", "fleet.fleet"),

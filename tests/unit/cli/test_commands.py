@@ -27,7 +27,7 @@ from envhub_sandbox.extras.judge.command import findings, static
 from envhub_sandbox.extras.judge.findings import Finding, Report
 from envhub_sandbox.extras.remote import doctor as doctor_server
 from envhub_sandbox.extras.remote.sandbox import RemoteSandbox
-from envhub_sandbox.hub.checkout import make_checkout
+from envhub_sandbox.extras.sources.checkout import make_checkout
 from envhub_worker.protocol import messages as m
 from tests.attacks.client.lying_server import LyingServer, lying
 

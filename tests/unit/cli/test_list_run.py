@@ -26,7 +26,7 @@ from envhub_sandbox.extras.judge.command.deadline import DeadlineReached, deadli
 from envhub_sandbox.extras.judge.command.list_run import ListRun
 from envhub_sandbox.extras.judge.findings import Report
 from envhub_sandbox.extras.judge.references import ListEntry
-from envhub_sandbox.hub.checkout import make_checkout
+from envhub_sandbox.extras.sources.checkout import make_checkout
 from tests.support.output.pages import HOSTILE
 
 _RUNNER = CliRunner()

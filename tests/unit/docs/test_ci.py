@@ -17,7 +17,7 @@ from packaging.utils import canonicalize_name
 from typer.testing import CliRunner
 
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.hub.sources import toml
+from envhub_sandbox.extras.sources import toml
 from tests.support.repositories import write_repository
 
 _RECORDS = """#!/bin/sh

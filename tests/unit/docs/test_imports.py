@@ -76,7 +76,7 @@ MAY_IMPORT = {
         *("extras.packages", "extras.remote", "sandboxes", "transport")
     },
     "envhub_sandbox.extras.judge": {
-        *("", "cli", "extras.packages", "factory", "hub", "play", "vector")
+        *("", "cli", "extras.packages", "extras.sources", "factory", "hub", "play", "vector")
     },
     "envhub_sandbox.extras.packages": {"cli", "extras.sources", "factory", "hub"},
     "envhub_sandbox.extras.ray": {"extras.packages", "extras.remote", "sandboxes", "transport"},

@@ -20,8 +20,8 @@ from envhub_sandbox.extras.packages.interpreters import Interpreter
 from envhub_sandbox.extras.packages.locks import pylock
 from envhub_sandbox.extras.packages.locks.pylock import PylockPackage, as_toml, rows
 from envhub_sandbox.extras.packages.request import DATE
+from envhub_sandbox.extras.sources.toml import table
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.hub.sources.toml import table
 from envhub_sandbox.system.folders import write_whole_file
 
 FORMAT = 1

@@ -25,9 +25,9 @@ from envhub_sandbox.extras.packages.builds.wheels import WheelOrigin, describe
 from envhub_sandbox.extras.packages.declared import Source, of_git
 from envhub_sandbox.extras.packages.resolution import index, uv
 from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target, torch_options
+from envhub_sandbox.extras.sources import toml
+from envhub_sandbox.extras.sources.toml import table
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.hub.sources import toml
-from envhub_sandbox.hub.sources.toml import table
 
 MAX_CHARACTERS = 16 * 1024 * 1024
 MAX_PACKAGES = 2000

@@ -18,7 +18,7 @@ from envhub_sandbox.extras.packages import interpreters
 from envhub_sandbox.extras.packages.declared import Source, WantedPackage, parse_requirement
 from envhub_sandbox.extras.packages.request import PackageRequest, Tell
 from envhub_sandbox.extras.packages.resolution import index, uv
-from envhub_sandbox.hub.sources import toml
+from envhub_sandbox.extras.sources import toml
 from envhub_sandbox.settings.options import option_name
 
 WORKERS = ("cloudpickle>=3", "gymnasium>=0.26", "msgpack>=1.0.5", "numpy>=1.21")

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 from envhub_sandbox.extras.judge.checks import Severity
 from envhub_sandbox.extras.judge.static import Survey, survey
+from envhub_sandbox.extras.sources import parser, parsing
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.hub.sources import parser, parsing
 from tests.support.repositories import write_repository
 
 _ENTRY = "def make_env(n_envs=1, use_async_envs=False): pass"

@@ -15,9 +15,8 @@ from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.extras.judge.checks import Severity
 from envhub_sandbox.extras.judge.findings import Finding
 from envhub_sandbox.extras.judge.static import survey
-from envhub_sandbox.hub import checkout
+from envhub_sandbox.extras.sources import checkout, parsing
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.hub.sources import parsing
 from tests.hub.olah_server import GitRepository
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")

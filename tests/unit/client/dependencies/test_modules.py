@@ -26,8 +26,8 @@ from envhub_sandbox.extras.packages.request import (
 from envhub_sandbox.extras.packages.resolution import resolutions
 from envhub_sandbox.extras.packages.resolution import resolve as resolving
 from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target
+from envhub_sandbox.extras.sources import parsing
 from envhub_sandbox.hub.snapshot import Snapshot, local, snapshot_named
-from envhub_sandbox.hub.sources import parsing
 from tests.hub.stub_hub import StubHub
 from tests.support import inside
 from tests.support.packages.refusals import refused_dependency

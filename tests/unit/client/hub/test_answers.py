@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+from envhub_sandbox.extras.sources import toml
 from envhub_sandbox.hub import answers
 from envhub_sandbox.hub.answers import HostileAnswerError, Kind, bounded_body, guarded
-from envhub_sandbox.hub.sources import toml
 
 
 def failed(error: BaseException, *secrets: str) -> answers.HubFailure:

@@ -1,1 +1,1 @@
-"""Unit tests of ``envhub_sandbox/hub/sources``."""
+"""Unit tests of ``envhub_sandbox/extras/sources``."""

@@ -12,9 +12,9 @@ import pytest
 from packaging.requirements import Requirement
 
 from envhub_sandbox.extras.judge.static import undeclared
+from envhub_sandbox.extras.sources import parser, parsing
+from envhub_sandbox.extras.sources import parsing as source
 from envhub_sandbox.hub.snapshot import Snapshot, local
-from envhub_sandbox.hub.sources import parser, parsing
-from envhub_sandbox.hub.sources import parsing as source
 from tests.support.repositories import write_repository
 
 _ENTRY = """

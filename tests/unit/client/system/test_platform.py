@@ -127,7 +127,7 @@ with deadline_alarm(60):
 """
 _PARSES = """
 import time
-from envhub_sandbox.hub.sources import parser
+from envhub_sandbox.extras.sources import parser
 parser.CPU_S = 5.0
 whole = parser.described
 parser.described = lambda data: time.sleep(60) if b"slow" in data else whole(data)

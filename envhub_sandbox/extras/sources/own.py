@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
-from envhub_sandbox.hub.sources import parsing
+from envhub_sandbox.extras.sources import parsing
 
 _INIT = "__init__.py"
 _MACHINE_CODE = (".so", ".pyd")

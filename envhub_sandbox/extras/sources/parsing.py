@@ -22,8 +22,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from envhub_sandbox.extras.sources import parser
 from envhub_sandbox.hub.listing import Snapshot
-from envhub_sandbox.hub.sources import parser
 from envhub_sandbox.system.platform import open_flags, own_variables
 
 MOST_BYTES = 256 << 10
