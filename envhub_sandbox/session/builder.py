@@ -234,9 +234,9 @@ class Builder:
         This is the one place that decides which lane an environment has.
         """
         server = loaded.server
-        if not self._own:
-            return relay  # a runner has one lane, and environments of one jail share theirs
         if server.fd_path is None or self._repository.policy.lane == "frames":
+            if not self._own:
+                return relay  # a server has one pair of slabs for each runner
             from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 
             return ServedLane.open(relay, deadline)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -90,6 +91,7 @@ class JailHandle:
         report: One mapping per layer of the confinement: ``layer``, ``enforced``, ``detail``; of
             a container around it too.
         limits: Of its messages.
+        attaching: Held from the deposit of descriptors for a runner until it has taken them.
         before_end: Runs before it is ended; brings what it has printed last.
         warnings: Those of its repository.
         watched: The values that its runners watch.
@@ -108,6 +110,7 @@ class JailHandle:
         self.runners = list(runners)
         self.kept = False
         self.report = report
+        self.attaching = threading.RLock()  # interruption.md, rule 12
         self.before_end: Callable[[], None] = _nothing
         self.warnings = RemoteWarnings()
         self.watched = WatchedAttributes()
@@ -118,6 +121,7 @@ class JailHandle:
         """The same jail over another connection of ours."""
         jail = JailHandle(client, self.number, self.runners, self.report, self.limits)
         jail.before_end, jail.warnings, jail.watched = self.before_end, self.warnings, self.watched
+        jail.attaching = self.attaching
         return jail
 
     def start_runners(self, count: int, deadline: Deadline) -> list[int]:

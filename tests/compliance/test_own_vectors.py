@@ -1,6 +1,11 @@
 """Repositories' own vector environments, wrapped ones, and old or odd results and errors."""
 
 import builtins
+import itertools
+import threading
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +16,10 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError, RemoteEnvWarning, RemoteProtocolError
+from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.shared_memory import lane
+from envhub_sandbox.transport.shared_memory.attachment import Attachment
+from envhub_worker.protocol import messages as m
 from tests.support import inside
 from tests.support.compare import assert_same
 from tests.support.in_process.interrupts import before_line
@@ -430,15 +438,15 @@ class Batch(gym.vector.VectorEnv):
         return tuple(getattr(self, name) for _ in range(self.num_envs))
 
 
-def make_env(n_envs=1, use_async_envs=False, mode="NextStep", wide=3):
-    return Batch(n_envs, mode, wide)
+def make_env(n_envs=1, use_async_envs=False, mode="NextStep", wide=3, tasks=1):
+    return {"suite": {task: Batch(n_envs, mode, wide + task) for task in range(tasks)}}
 '''
 
 
-def _played(env: Any) -> list[Any]:
-    """What it returns and raises, and again once all of it has come."""
-    heard: list[Any] = [env.reset(seed=0)]
-    for number in range(40):
+def _played(envs: list[Any]) -> list[Any]:
+    """What they return and raise in turns, and again once all of it has come."""
+    heard: list[Any] = [env.reset(seed=seed) for seed, env in enumerate(envs)]
+    for number, env in itertools.product(range(40), envs):
         try:
             heard.append(env.step(np.full((2, 2), number, np.float32)))
         except (RemoteEnvError, RemoteProtocolError) as error:
@@ -449,22 +457,70 @@ def _played(env: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-@pytest.mark.parametrize(("wide", "copy"), [(3, True), (20_000, False)])
+@pytest.mark.parametrize(
+    ("wide", "copy", "tasks", "restart"),
+    [(3, True, 1, "never"), (20_000, False, 1, "transparent"), (3, False, 2, "never")],
+)
 def test_an_own_vector_is_stepped_in_shared_memory_and_returns_the_same(
-    tmp_path: Path, mode: str, wide: int, copy: bool
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    mode: str,
+    wide: int,
+    copy: bool,
+    tasks: int,
+    restart: str,
 ) -> None:
-    """Whatever it returns, also where that does not fit, or changes its form; and its errors."""
+    """Whatever it returns, also where that does not fit, or changes its form; and its errors.
+
+    Also where several share a process, and where a process that dies is replaced.
+    """
     pytest.importorskip("torch")
     folder = write_repository(tmp_path, _PLAIN)
-    options: dict[str, Any] = {"env_kwargs": {"mode": mode, "wide": wide}, "copy": copy}
-    with make_env(folder, 2, policy={"lane": "frames"}, **options) as suites:
-        expected = _played(suites.env)
-    with make_env(folder, 2, **options) as suites:
-        assert suites.env.reset()[0]["camera"].flags.owndata == copy
-        actual = _played(suites.env)
-    assert_same(expected, actual)
-    errors = [heard for heard in actual if isinstance(heard, str)]
-    assert ["no step 5" in errors[0], "rewards" in errors[1], len(errors)] == [True, True, 4]
+    options: dict[str, Any] = {"env_kwargs": {"mode": mode, "wide": wide, "tasks": tasks}}
+    options |= {"copy": copy, "n_envs": 2}
+    heard, relayed = {}, Counter[str]()
+    relay = JailHandle.send_relay
+
+    def counted(self: JailHandle, message: m.Relay, *args: Any) -> int:
+        relayed[message.operation] += 1
+        return relay(self, message, *args)
+
+    monkeypatch.setattr(JailHandle, "send_relay", counted)
+    for kind in ("frames", "auto"):
+        with make_env(folder, policy={"lane": kind, "restart": restart}, **options) as suites:
+            envs = list(suites["suite"].values())
+            owned = [env.reset()[0]["camera"].flags.owndata for env in envs]
+            assert owned == [copy or kind == "frames"] * tasks
+            relayed.clear()
+            heard[kind] = _played(envs)
+            by_server = dict(relayed)
+    assert_same(heard["frames"], heard["auto"])
+    assert by_server == {"step": 5 * tasks}  # infos that do not fit
+    errors = [text for text in heard["auto"] if isinstance(text, str)]
+    assert len(errors) == 4 * tasks
+    assert ["no step 5" in errors[0], "rewards" in errors[tasks]] == [True, True]
+
+
+def test_environments_of_one_jail_get_their_own_slabs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where another one gives its slabs to the same process at that moment."""
+    pytest.importorskip("torch")
+    folder = write_repository(tmp_path, _PLAIN)
+    both, hand_over = threading.Barrier(2), Attachment.hand_over
+
+    def slowly(self: Attachment, *args: Any) -> None:
+        hand_over(self, *args)
+        with suppress(threading.BrokenBarrierError):
+            both.wait(1)
+
+    monkeypatch.setattr(Attachment, "hand_over", slowly)
+    with make_env(folder, 2, env_kwargs={"tasks": 2}) as suites, ThreadPoolExecutor(2) as pool:
+        envs = suites["suite"]
+        resets = [pool.submit(envs[task].reset, seed=task) for task in range(2)]
+        seen = [reset.result()[0] for reset in resets]
+        seen += [envs[task].step(np.zeros((2, 2), np.float32))[0] for task in range(2)]
+    assert [set(each["camera"].flat) for each in seen] == [{0}, {1}, {1}, {2}]
 
 
 def test_an_interrupted_step_leaves_the_next_reset_its_own(tmp_path: Path) -> None:

@@ -5,11 +5,11 @@ A step costs one wake-up per shard and one copy out. Infos that did not fit go o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from time import perf_counter_ns
 from typing import Any
 
-from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import RunnersDiedError
@@ -21,17 +21,16 @@ from envhub_sandbox.transport.shared_memory.client_slabs import (
     Outcome,
     SlotRing,
     action_layouts,
-    by_shard,
     infos_of,
 )
-from envhub_sandbox.transport.shared_memory.lane import STEP, RunnerGoneError, SharedMemoryLane
+from envhub_sandbox.transport.shared_memory.lane import STEP, SharedMemoryLane
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 
-_CAUSE_S = 10.0
 _NOTHING: list[Outcome] = []
+_NO_MORE: Outcome = (slabs.DONE, None)
 
 
 class ColumnLane(SharedMemoryLane):
@@ -109,8 +108,12 @@ class ColumnLane(SharedMemoryLane):
 
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""
-        outcomes = self._outcomes(deadline)
-        self._said = self._with_fetched(outcomes, deadline) if outcomes else _NOTHING
+        deaths = self._wait_for_all(deadline)
+        self._said = self._outcomes(deaths)
+        if self._said:
+            self._take_infos(deaths, deadline)
+        if deaths:
+            raise RunnersDiedError(self._stepped(deaths), deaths)
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
         """See ``Lane``. Trust: input from the worker."""
@@ -129,54 +132,43 @@ class ColumnLane(SharedMemoryLane):
         parts = [infos_of(shard, outcome, self.declared) for shard, outcome in shards]
         return self.declared.infos(parts)
 
-    def _outcomes(self, deadline: Deadline) -> list[Outcome]:
+    def _outcomes(self, deaths: Collection[int]) -> list[Outcome]:
         """Every shard's outcome; nothing at all if none says more than its results."""
-        try:
-            self._wait_for_all(deadline)
-        except RunnerGoneError:
-            self._meet_deaths(deadline)
         for shard in self.shards:
-            if not shard.has_nothing_to_say():
-                return [shard.outcome() for shard in self.shards]
+            if deaths or not shard.has_nothing_to_say():
+                return [
+                    _NO_MORE if index in deaths else shard.outcome()
+                    for index, shard in enumerate(self.shards)
+                ]
         return _NOTHING
 
-    def _with_fetched(self, outcomes: list[Outcome], deadline: Deadline) -> list[Outcome]:
-        """The same with the infos that did not fit; what one has raised comes before them."""
-        kinds = [kind for kind, _ in outcomes]
-        asked = self._fetching[0] == self._asked_ns  # then they are taken: warnings come with them
-        if slabs.FETCH not in kinds or (slabs.RAISED in kinds and not asked):
-            return outcomes
-        missing = [index for index, kind in enumerate(kinds) if kind == slabs.FETCH]
-        self._refuse_further(missing)
-        try:
-            replies = self._fetch(missing, deadline)
-        except RunnersDiedError as error:
-            raise self._died(by_shard(error, missing), deadline) from None
-        for index, reply in zip(missing, replies, strict=True):
-            outcomes[index] = slabs.DONE, reply
-        return outcomes
+    def _take_infos(self, deaths: dict[int, WorkerDiedError], deadline: Deadline) -> None:
+        """Put the infos in that did not fit.
 
-    def replies(self, deadline: Deadline) -> list[m.Message]:
-        """See ``Lane``."""
-        replies = super().replies(deadline)
-        return self._with_observations(replies) if self._asked == "reset" else replies
+        What one has raised comes before them, unless a recovery needs them or they were asked for:
+        warnings come with them.
+        """
+        kinds = [kind for kind, _ in self._said]
+        if deaths or self._fetching[0] == self._asked_ns or slabs.RAISED not in kinds:
+            missing = [index for index, kind in enumerate(kinds) if kind == slabs.FETCH]
+            for index, reply in self._fetched(missing, deaths, deadline).items():
+                self._said[index] = slabs.DONE, reply
 
-    def catch_up(self, deadline: Deadline) -> None:
-        """See ``Lane``."""
+    def _drop(self, deaths: dict[int, WorkerDiedError]) -> None:
         if self._asked == STEP:
-            self._catch_up_with_server(deadline)
-            self._outcomes(deadline)  # it may carry the schema of later columns
-        else:
-            super().catch_up(deadline)
+            self._outcomes(deaths)  # it may carry the schema of later columns
+        super()._drop(deaths)
 
-    def _with_observations(self, replies: Sequence[m.Message]) -> list[m.Message]:
-        """Replies to a reset as they would have come through the server."""
+    def _as_messages(self, answers: list[m.Message | None]) -> list[m.Message | None]:
+        """See ``SharedMemoryLane``: the observations of a reset lie in the slab."""
+        if self._asked != "reset":
+            return answers
         with UNTRUSTED:
             return [
                 reply
-                if isinstance(reply, m.RaisedException)
+                if reply is None or isinstance(reply, m.RaisedException)
                 else m.ResetDone(part, self.declared.info(reply))
-                for part, reply in zip(self._observations(), replies, strict=True)
+                for part, reply in zip(self._observations(), answers, strict=True)
             ]
 
     def _observations(self) -> list[Any]:
@@ -184,56 +176,16 @@ class ColumnLane(SharedMemoryLane):
         space = self.declared.manifest.single_observation_space
         return list(batches.split(space, self.observations.take(), self._bounds))
 
-    # --- deaths --------------------------------------------------------------------------------
-
-    def _meet_deaths(self, deadline: Deadline) -> None:
-        """Return where a kept jail's runners have all answered before one of them died.
-
-        Raises:
-            RunnersDiedError: Some have not; all the others have.
-            WorkerDiedError: The jail has ended.
-            WorkerTimeoutError: The deadline came before the answer of one that lives.
-        """
-        if not self.jail.kept:
-            raise self.jail.cause_of_death(self._asked) from None
-        answers = self._attachment.answers
-        dead = [i for i, shard in enumerate(self.shards) if not answers(i, shard, deadline)]
-        if dead:
-            raise self._died(self._deaths_of(dead), deadline) from None
-
-    def _deaths_of(self, dead: Sequence[int]) -> dict[int, WorkerDiedError]:
-        try:  # the server knows how, at the latest when they have been reaped
-            self._fetch(dead, Deadline(_CAUSE_S))
-        except RunnersDiedError as error:
-            return by_shard(error, dead)
-        raise RemoteProtocolError("the worker says that a process lives which has died")
-
-    def _died(self, deaths: dict[int, WorkerDiedError], deadline: Deadline) -> RunnersDiedError:
-        """Deaths in a step, and what the living wrote, as the messages that it stands for.
-
-        Who dies before his infos are fetched is added to the deaths. Trust: input from the worker.
-        """
-        living: dict[int, Outcome] = {}
-        for index, shard in enumerate(self.shards):
-            if index in deaths:
-                continue
-            try:
-                outcome = shard.outcome()
-                if outcome[0] == slabs.FETCH:
-                    outcome = slabs.DONE, self._fetch([index], deadline)[0]
-                living[index] = outcome
-            except RunnersDiedError as error:
-                deaths[index] = error.first
-            except WorkerDiedError as error:
-                deaths[index] = error
-        replies: list[m.Message | None] = [None] * len(self.shards)
+    def _stepped(self, deaths: Collection[int]) -> list[m.Message | None]:
+        """What the living wrote, as messages. Trust: input from the worker."""
         with UNTRUSTED:
-            parts, flags = self._observations(), self.observations.results()
-            for index, said in living.items():
-                replies[index] = self._stepped(index, said, parts[index], flags)
-        return RunnersDiedError(replies, deaths)
+            flags, replies = self.observations.results(), []
+            for index, part in enumerate(self._observations()):
+                replies.append(None if index in deaths else self._step_done(index, part, flags))
+        return replies
 
-    def _stepped(self, index: int, outcome: Outcome, observation: Any, flags: Any) -> m.Message:
+    def _step_done(self, index: int, observation: Any, flags: Any) -> m.Message:
+        outcome = self._said[index]
         if isinstance(outcome[1], m.RaisedException):
             return outcome[1]
         rewards, over, cut = (column[slice(*self._bounds[index])] for column in flags)

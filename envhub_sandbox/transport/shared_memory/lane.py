@@ -1,7 +1,7 @@
 """The fast lane: messages over shared memory, straight to the jail's runners; steps are messages.
 
-What does not fit, and what may have to be repeated in a fresh runner, goes over the server, as on
-the lane that it derives from. ``ColumnLane`` derives from this one, and steps without messages.
+What does not fit goes over the server, as on the lane that it derives from. ``ColumnLane`` derives
+from this one, and steps without messages.
 """
 
 from __future__ import annotations
@@ -17,9 +17,14 @@ from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import Cores, Deadline, SpinChooser, own_cpus
 from envhub_sandbox.transport.jail import Frames
 from envhub_sandbox.transport.lane import Lane
-from envhub_sandbox.transport.replies import typed_reply
+from envhub_sandbox.transport.replies import RunnersDiedError, typed_reply
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
-from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard, SlotRing, message_layouts
+from envhub_sandbox.transport.shared_memory.client_slabs import (
+    LaneShard,
+    SlotRing,
+    by_shard,
+    message_layouts,
+)
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 
@@ -32,10 +37,8 @@ _BULKY = frozenset({"render"})
 """What hardly ever fits the slabs."""
 _BATCHES = frozenset({STEP, "reset"})
 """Operations that return a batch of observations, which goes into a slot."""
-
-
-class RunnerGoneError(Exception):
-    """A runner has ended, or its jail, or the server; that one knows why, if it lives."""
+_CAUSE_S = 10.0
+"""For how long the server may take to say how a runner has died."""
 
 
 class SharedMemoryLane(Lane):
@@ -138,15 +141,20 @@ class SharedMemoryLane(Lane):
         # what then still waits in the server is closed there with the jail (``FdStore.drop``).
         # Nothing goes through the slabs before every runner has answered, for one that refuses
         # makes all of them use the other lane.
+        # The server keeps one deposit for each runner, which another environment may have as well.
         messages: list[tuple[int, m.Message]] = []
-        for index in shards:
-            try:
-                self._attachment.hand_over(index, self.runners[index], self.shards[index], deadline)
-            except WorkerDiedError as error:  # why, the server knows
-                raise self.jail.cause_of_death("make_env") from error
-            messages.append((self.runners[index], self._attach_message(index)))
-        replies = self.jail.exchange("attach", messages, deadline, deposited=True)
+        with self.jail.attaching:
+            for index in shards:
+                self._hand_over(index, deadline)
+                messages.append((self.runners[index], self._attach_message(index)))
+            replies = self.jail.exchange("attach", messages, deadline, deposited=True)
         return all(typed_reply(reply, m.Value).value is True for reply in replies)
+
+    def _hand_over(self, index: int, deadline: Deadline) -> None:
+        try:
+            self._attachment.hand_over(index, self.runners[index], self.shards[index], deadline)
+        except WorkerDiedError as error:  # why, the server knows
+            raise self.jail.cause_of_death("make_env") from error
 
     def _attach_message(self, index: int) -> m.Attach:
         return m.Attach(self.number, 0, 0, self.slots[index].count)
@@ -209,8 +217,7 @@ class SharedMemoryLane(Lane):
             shard.tell(frames, (slot, spin_ns, cpus[index]), ring)
 
     def _goes_by_slabs(self, operation: str, packed: Sequence[Frames]) -> bool:
-        # what may have to be repeated in a fresh runner goes by the server, who knows the dead
-        if self.jail.kept or operation in _BULKY:
+        if operation in _BULKY:
             return False
         pairs = zip(self.shards, packed, strict=True)
         return all(shard.has_room(frames) for shard, frames in pairs)
@@ -247,16 +254,41 @@ class SharedMemoryLane(Lane):
         operation = self._asked
         if operation == BY_SERVER:
             return super().replies(deadline)
-        self._wait_or_say_why(deadline)
-        answers = [shard.answer(self.jail.limits) for shard in self.shards]
-        missing = [index for index, answer in enumerate(answers) if answer is None]
-        if missing:
-            self._refuse_further(missing)
-            for index, reply in zip(missing, self._fetch(missing, deadline), strict=True):
-                answers[index] = reply
+        deaths = self._wait_for_all(deadline)
+        living = [index for index in range(len(self.shards)) if index not in deaths]
+        answers = {index: self.shards[index].answer(self.jail.limits) for index in living}
+        missing = [index for index, answer in answers.items() if answer is None]
+        answers.update(self._fetched(missing, deaths, deadline))
         if operation != STEP:
             MESSAGES.debug("< %s in shared memory", operation)
-        return [answer for answer in answers if answer is not None]
+        replies = self._as_messages([answers.get(index) for index in range(len(self.shards))])
+        if deaths:
+            raise RunnersDiedError(replies, deaths)
+        return [reply for reply in replies if reply is not None]
+
+    def _as_messages(self, answers: list[m.Message | None]) -> list[m.Message | None]:
+        """The answers to a message as they would have come through the server; None of the dead."""
+        return answers
+
+    def _fetched(
+        self, missing: Sequence[int], deaths: dict[int, WorkerDiedError], deadline: Deadline
+    ) -> dict[int, m.Message | None]:
+        """What did not fit, by shards. Who dies meanwhile is added to the deaths.
+
+        Trust: input from the worker. An answer that says after ``answered`` that more has to be
+        fetched is refused: that may never come, and others wait meanwhile.
+        """
+        if not missing:
+            return {}
+        if self._settled_ns == self._asked_ns and self._fetching != (self._asked_ns, missing):
+            raise RemoteProtocolError("the worker has changed an answer that was there already")
+        replies: Sequence[m.Message | None]
+        try:
+            replies = self._fetch(missing, deadline)
+        except RunnersDiedError as error:
+            replies = error.replies
+            deaths.update(by_shard(error, missing))
+        return dict(zip(missing, replies, strict=True))
 
     def answered(self) -> bool:
         """See ``Lane``. What has to be fetched is asked for here: a runner may never give it."""
@@ -296,23 +328,25 @@ class SharedMemoryLane(Lane):
 
     def catch_up(self, deadline: Deadline) -> None:
         """See ``Lane``."""
-        self._catch_up_with_server(deadline)
-        if self._asked != BY_SERVER:  # not read: its slot may have been chosen, and nothing sent
-            self._wait_or_say_why(deadline)
-
-    def _catch_up_with_server(self, deadline: Deadline) -> None:
         super().catch_up(deadline)
         # with what ``answered`` has asked for besides: it is asked for anew
         self._settled_ns, self._fetching = 0, (0, ())
+        if self._asked != BY_SERVER:
+            self._drop(self._wait_for_all(deadline))
+
+    def _drop(self, deaths: dict[int, WorkerDiedError]) -> None:
+        """Take no answer: where one lies was chosen, but perhaps the request never sent."""
+        if deaths:
+            raise RunnersDiedError([None] * len(self.shards), deaths)
 
     # --- waiting -------------------------------------------------------------------------------
 
-    def _wait_for_all(self, deadline: Deadline) -> None:
-        """Until every shard has answered.
+    def _wait_for_all(self, deadline: Deadline) -> dict[int, WorkerDiedError]:
+        """Until every shard has answered; returns which runners of a kept jail have died before.
 
         Raises:
             WorkerTimeoutError: The deadline came first.
-            RunnerGoneError: A runner ended first.
+            WorkerDiedError: The jail has ended.
         """
         # In this order. The sleepers, who share this core, cannot run before we sleep: so we sleep
         # for them first, at once, while the others compute on their own cores. What these have
@@ -325,22 +359,17 @@ class SharedMemoryLane(Lane):
         # as it was, and ``catch_up`` waits for the same answers again: to wait takes nothing away.
         # What ``answered`` has found is not waited for: a jail may take it back, and others would
         # wait for it as well.
-        if self._settled_ns != self._asked_ns:
-            self._wait_for_each(deadline)
+        if self._settled_ns != self._asked_ns and not self._all_answer(deadline):
+            return self._deaths(deadline)
         self.elapsed_ns = perf_counter_ns() - self._asked_ns
         self._spin.measured(self.elapsed_ns)
+        return {}
 
-    def _wait_or_say_why(self, deadline: Deadline) -> None:
-        """``_wait_for_all``; raises the reason if a runner has ended."""
-        try:
-            self._wait_for_all(deadline)
-        except RunnerGoneError:
-            raise self.jail.cause_of_death(self._asked) from None
-
-    def _wait_for_each(self, deadline: Deadline) -> None:
+    def _all_answer(self, deadline: Deadline) -> bool:
+        """Wait for every shard; whether they have answered before one of the runners ended."""
         for shard in self._sleepers:
             if not shard.answered_before_death(self._watch, deadline):
-                raise RunnerGoneError
+                return False
         budget_ns = self._spin.budget_ns
         until_ns = perf_counter_ns() + budget_ns
         for shard in self._wakers:
@@ -348,15 +377,22 @@ class SharedMemoryLane(Lane):
                 if budget_ns:
                     self._spin.missed()
                 if not shard.answered_before_death(self._watch, deadline):
-                    raise RunnerGoneError
+                    return False
+        return True
 
-    def _refuse_further(self, missing: Sequence[int]) -> None:
-        """Refuse an answer that says after ``answered`` that more has to be fetched.
-
-        Trust: input from the worker, which may never give that; others wait meanwhile.
-        """
-        if self._settled_ns == self._asked_ns and self._fetching != (self._asked_ns, missing):
-            raise RemoteProtocolError("the worker has changed an answer that was there already")
+    def _deaths(self, deadline: Deadline) -> dict[int, WorkerDiedError]:
+        """A runner has ended, or its jail, or the server; that one knows why, if it lives."""
+        if not self.jail.kept:
+            raise self.jail.cause_of_death(self._asked)
+        answers = self._attachment.answers
+        dead = [i for i, shard in enumerate(self.shards) if not answers(i, shard, deadline)]
+        if not dead:  # they had answered before
+            return {}
+        try:  # how, the server knows at the latest when they have been reaped
+            self._fetch(dead, Deadline(_CAUSE_S))
+        except RunnersDiedError as error:
+            return by_shard(error, dead)
+        raise RemoteProtocolError("the worker says that a process lives which has died")
 
     # --- the rest ------------------------------------------------------------------------------
 

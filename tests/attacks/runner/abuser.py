@@ -93,7 +93,7 @@ honest, kept, lanes = runner.Runner.attach, [], []
 def keep(self, request):
     kept.extend(map(os.dup, self.descriptors))
     reply = honest(self, request)
-    lanes.append(self.lane)
+    lanes.append(self.lanes[request.env])
     return reply
 
 runner._HANDLERS[m.Attach] = keep

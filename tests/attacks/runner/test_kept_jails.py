@@ -102,7 +102,7 @@ def remember(self, request):
         list(map(os.close, self.descriptors))
         return m.Value(False)  # so that steps come as messages
     reply = attach(self, request)
-    runner_of["lane"] = self.lane
+    runner_of["lane"] = self.lanes[request.env]
     return reply
 
 def lie(self, received):

@@ -81,16 +81,21 @@ class Lane:
         self._told[slabs.PARKED] = 1
         self._served = self._changes = self._cpu = self._spin_ns = 0
 
-    def wake(self) -> bool:
-        """After the doorbell: silence it, and serve while requests keep coming quickly.
-        Returns whether it can ring again: no, once the client has closed its end.
+    def wake(self, *, alone: bool) -> bool:
+        """After the doorbell: silence it, and serve; if ``alone``, while requests keep coming
+        quickly. Returns whether it can ring again: no, once the client has closed its end.
         """
         rung = True
         with contextlib.suppress(BlockingIOError):
             rung = bool(os.read(self.bell, 8))
-        while self.serve() and self._wait_awake():
+        while self.serve() and alone and self._wait_awake():
             pass
         return rung
+
+    def close(self) -> None:
+        """Give the doorbells back; the slabs go with the last array over them."""
+        os.close(self.bell)
+        os.close(self._client_bell)
 
     def _wait_awake(self) -> bool:
         """Wait for the next request without sleeping, for as long as the client says."""

@@ -10,7 +10,7 @@ import os
 import select
 import socket
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from time import monotonic
 from typing import Any
@@ -56,26 +56,33 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     poller = select.poll()
     poller.register(stream, select.POLLIN)
     timeout: int | None = None
-    bell: int | None = None  # that is registered: of the lane, until the client has closed its end
+    bells: dict[int, Lane] = {}
     while True:
         ready = [fd for fd, _ in poller.poll(timeout)]
-        lane = runner.lane
         if stream.fileno() in ready:
             if not _serve(stream, reader, runner):
                 return 0
-            if runner.lane is not lane and runner.lane is not None:
-                if bell is not None:  # where another runner refused, the client tries another lane
-                    poller.unregister(bell)
-                bell = runner.lane.bell
-                poller.register(bell, select.POLLIN)
-        elif lane is not None and bell is not None and ready:
-            if not lane.wake():
-                poller.unregister(bell)
-                bell = None
-        elif lane is not None:
-            lane.serve()
+        elif ready:
+            for lane in [bells[bell] for bell in ready]:
+                # one alone may wait awake for the next request: others would wait for that
+                if not lane.wake(alone=len(bells) == 1):
+                    runner.forget_lane(lane)
+        else:
+            for lane in bells.values():
+                lane.serve()
+        if list(bells.values()) != list(runner.lanes.values()):
+            bells = _hear(poller, bells, runner.lanes.values())
         # a request may cross with our going to sleep: look again soon, once
-        timeout = _RECHECK_MS if ready and runner.lane is not None else None
+        timeout = _RECHECK_MS if ready and bells else None
+
+
+def _hear(poller: select.poll, bells: Collection[int], lanes: Collection[Lane]) -> dict[int, Lane]:
+    """Listen to the doorbells of these lanes, and no others any more."""
+    for bell in bells:
+        poller.unregister(bell)
+    for lane in lanes:
+        poller.register(lane.bell, select.POLLIN)
+    return {lane.bell: lane for lane in lanes}
 
 
 def _serve(stream: socket.socket, reader: StreamReader, runner: Runner) -> bool:
@@ -118,7 +125,7 @@ class Runner:
         self._stage = ""
         self.warned = WarningLog()
         self.watches = Watches()
-        self.lane: Lane | None = None
+        self.lanes: dict[int, Lane] = {}
         self.descriptors: list[int] = []
 
     def answer(self, packet: Packet) -> list[Any]:
@@ -133,14 +140,15 @@ class Runner:
         except Exception as error:  # of a class that is not to be had here, for instance
             return m.pack(raised(error, "arguments"))
         self._stage = type(request).__name__.lower()
-        if self.lane is not None and not by_lane:
-            if isinstance(request, m.FetchInfos) and self.lane.unsent:
-                return self.lane.unsent
-            if isinstance(request, (m.Reset, m.Step)) and request.env == self.lane.number:
-                self.lane.leave_slot()
+        lane = self.lanes.get(getattr(request, "env", -1))
+        if lane is not None and not by_lane:
+            if isinstance(request, m.FetchInfos) and lane.unsent:
+                return lane.unsent
+            if isinstance(request, (m.Reset, m.Step)):
+                lane.leave_slot()
         try:
             reply = _HANDLERS[type(request)](self, request)
-            if by_lane and isinstance(reply, m.ResetDone) and self.lane and self.lane.has_columns:
+            if by_lane and isinstance(reply, m.ResetDone) and lane and lane.has_columns:
                 reply = m.Value(reply.info)  # the observation lies in the slab already
             return (self._pack_infos if type(request) in _WITH_INFOS else self._pack)(reply)
         except ResultError as error:
@@ -235,16 +243,25 @@ class Runner:
             self.watches,
         )
         if not request.count:
-            self.lane = Lane(request, *options)
+            lane = Lane(request, *options)
         elif isinstance(env, SubEnvs) and not env.reward_shape:
-            self.lane = ColumnLane(env, self._pack_infos, request, *options)
+            lane = ColumnLane(env, self._pack_infos, request, *options)
         else:
             return m.Value(False)
+        if request.env in self.lanes:  # another runner has refused it
+            self.forget_lane(self.lanes[request.env])
+        self.lanes[request.env] = lane
         return m.Value(True)
+
+    def forget_lane(self, lane: Lane) -> None:
+        """The client has closed it, or its environment."""
+        del self.lanes[lane.number]
+        lane.close()
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:
         """The last step's infos, which did not fit the slab."""
-        return m.Value({} if self.lane is None else self.lane.infos())
+        lane = self.lanes.get(request.env)
+        return m.Value({} if lane is None else lane.infos())
 
     def fetch_infos_apart(self, request: m.FetchInfosApart) -> m.Message:
         """The last reset's or step's infos, as each sub-environment gave them."""
@@ -355,6 +372,8 @@ class Runner:
         env = self._envs.pop(request.env, None)
         self._generators.pop(request.env, None)
         self.watches.forget(request.env)
+        if request.env in self.lanes:
+            self.forget_lane(self.lanes[request.env])
         if env is not None:
             env.close()
         return m.Value(None)

@@ -83,6 +83,7 @@ class OutputTail:
 
 
 _WORD = 8
+_MAX_PAIRS = 128
 
 
 class IdleTimer:
@@ -90,7 +91,7 @@ class IdleTimer:
 
     def __init__(self, limit_s: float) -> None:
         self.limit_s = limit_s
-        self._slabs: dict[int, list[int]] = {}
+        self._slabs: dict[int, list[Sequence[int]]] = {}
         self._seen: list[int] = []
         self.begin()
 
@@ -99,13 +100,19 @@ class IdleTimer:
         self._since = monotonic()
 
     def watch(self, runner: int, fds: Sequence[int]) -> None:
-        """Count a runner's steps, too. Takes the descriptors over: request slab and reply slab."""
-        self.forget(runner)
-        self._slabs[runner] = list(fds)
+        """Count an environment's steps, too. Takes over its request slab and its reply slab.
+
+        What a runner has closed is not told; of many environments the last ones are counted.
+        """
+        pairs = self._slabs.setdefault(runner, [])
+        pairs.append(fds)
+        if len(pairs) > _MAX_PAIRS:
+            close_fds(pairs.pop(0))
 
     def forget(self, runner: int) -> None:
-        """A runner has gone, or there was none."""
-        close_fds(self._slabs.pop(runner, []))
+        """A runner has gone."""
+        for fds in self._slabs.pop(runner, []):
+            close_fds(fds)
 
     def close(self) -> None:
         """Give all descriptors back."""
@@ -114,8 +121,9 @@ class IdleTimer:
 
     def passed(self, busy: bool) -> bool:
         """Whether it was too long; ``busy``: some runner owes an answer to a message."""
-        sequences = [_sequence(request) for request, _ in self._slabs.values()]
-        answered = [_sequence(reply) for _, reply in self._slabs.values()]
+        pairs = [pair for pairs in self._slabs.values() for pair in pairs]
+        sequences = [_sequence(request) for request, _ in pairs]
+        answered = [_sequence(reply) for _, reply in pairs]
         if busy or sequences != answered or sequences + answered != self._seen:
             self._seen = sequences + answered
             self.begin()

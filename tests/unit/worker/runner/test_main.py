@@ -14,28 +14,35 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.stream import StreamReader, pack_packet
 from envhub_worker.runner import runner
+from tests.support.processes import eventually
 
 
 class QuietLane:
     """A lane of which nothing is asked; its doorbell is one end of a socket pair."""
 
-    def __init__(self) -> None:
+    def __init__(self, number: int) -> None:
+        self.number = number
         client, own = socket.socketpair()
         self.client, self.bell = client, own.detach()
 
-    def wake(self) -> bool:
+    def wake(self, *, alone: bool) -> bool:
         return bool(os.read(self.bell, 8))
 
     def serve(self) -> bool:
         return False
 
+    def close(self) -> None:
+        os.close(self.bell)
+        self.bell = -1
+
 
 def test_a_client_may_close_one_lane_and_then_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    lanes = [QuietLane(), QuietLane()]
+    lanes = [QuietLane(1), QuietLane(2)]
     attached = iter(lanes)
 
     def answer(self: Any, packet: Any) -> list[Any]:
-        self.lane = next(attached, self.lane)
+        for lane in [next(attached, None)]:
+            self.lanes.update({} if lane is None else {lane.number: lane})
         return m.pack(m.Value(True))
 
     monkeypatch.setattr(runner.Runner, "answer", answer)
@@ -57,8 +64,7 @@ def test_a_client_may_close_one_lane_and_then_another(monkeypatch: pytest.Monkey
             for lane in lanes:
                 lane.client.close()
             ask(3), ask(4)
+            assert eventually(lambda: [lane.bell for lane in lanes] == [-1, -1])
         finally:
             client.shutdown(socket.SHUT_WR)
             assert done.result(timeout=60) == 0
-    for lane in lanes:
-        os.close(lane.bell)
