@@ -50,7 +50,7 @@ _COMMANDS: dict[str, tuple[str, str | Where]] = {
     "init": (
         "Write a new environment's repository: env.py, requirements, card, licence, test, CI "
         "workflow.",
-        "cli.init:init",
+        "extras.starter.command:init",
     ),
     "replay": (
         "Repeat the requests of a crash bundle, and report whether it dies in the same way.",

@@ -1,6 +1,6 @@
 """``envhub doctor``: what this host, or a server on another, can enforce, found out by doing it.
 
-Each profile is tried with the environment of ``envhub init`` in a jail of its own, self-test
+Each profile is tried with an environment of Gymnasium in a jail of its own, self-test
 included: nothing is concluded from versions or settings. A jail stops at the first layer that is
 missing, so the layers are also tried one by one, to name all of them at once. On macOS and Windows
 there are no jails but in containers: there the profile that is asked for is tried in one.
@@ -23,7 +23,6 @@ from typing import Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.init import starter
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import (
     BAD,
@@ -46,6 +45,12 @@ from envhub_worker.protocol.confinement import PROFILES
 _PROBE_S = 60.0
 _PROFILES = ("profile", "available", "first step", "enforces", "without")
 _LAYERS = ("layer", "state", "what it does")
+_ENTRY = """
+import gymnasium as gym
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([lambda: gym.make("CartPole-v1")] * n_envs)
+"""
 _NOTHING_PROBED: dict[str, Any] = {"layers": [], "apparmor_profile": None, "gpu": None}
 _SANDBOX = "process" if IS_LINUX else "docker"
 
@@ -115,7 +120,7 @@ def doctor(
         raise UsageError("--insecure-loopback needs a server: envhub doctor tcp://HOST:PORT")
     with ProgressBar(quiet=json) as bar, _scratch_folder() as folder:
         (folder / "idle").mkdir()
-        (folder / "idle" / "env.py").write_text(starter("idle", 2026)["env.py"], "utf-8")
+        (folder / "idle" / "env.py").write_text(_ENTRY)
         trials = []
         for name in PROFILES if IS_LINUX else (profile,):
             bar.begin(f"trying {name}")

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.cli.init import starter
 from envhub_sandbox.extras.judge.judge import judge
 from envhub_sandbox.extras.judge.settings import JudgeOptions
+from envhub_sandbox.extras.starter.command import starter
 from envhub_sandbox.hub.local import LocalFolder
 from tests.support.command_line import COMMAND
 

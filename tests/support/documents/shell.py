@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from envhub_sandbox.cli.init import starter
+from envhub_sandbox.extras.starter.command import starter
 from tests.hub.stub_hub import StubHub
 from tests.support.documents.blocks import CHECKOUT, RUN, Block, tested
 

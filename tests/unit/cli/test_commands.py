@@ -17,7 +17,7 @@ import pytest
 from typer.testing import CliRunner
 
 from envhub_sandbox import __version__
-from envhub_sandbox.cli import cache, init
+from envhub_sandbox.cli import cache
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.shared import exits, host
 from envhub_sandbox.cli.shared.console import guarded
@@ -28,6 +28,7 @@ from envhub_sandbox.extras.judge.findings import Finding, Report
 from envhub_sandbox.extras.remote import doctor as doctor_server
 from envhub_sandbox.extras.remote.sandbox import RemoteSandbox
 from envhub_sandbox.extras.sources.checkout import make_checkout
+from envhub_sandbox.extras.starter import command as init
 from envhub_worker.protocol import messages as m
 from tests.attacks.client.lying_server import LyingServer, lying
 

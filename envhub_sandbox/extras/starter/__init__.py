@@ -1,0 +1,1 @@
+"""``envhub init``: the files of a new environment's repository."""
