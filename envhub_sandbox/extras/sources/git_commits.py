@@ -163,9 +163,7 @@ def fetched(url: str, commit: str, variables: Variables | None = None) -> Iterat
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
         store = Path(place)
         git = _Git(store, variables)
-        git.run("init", "--quiet", "--bare", "--template=", ".")
-        options = ("--quiet", "--depth=1", "--no-tags", "--no-recurse-submodules", "--no-auto-gc")
-        git.run("fetch", *options, source, commit)
+        git.fetch(source, commit)
         submodules: list[str] = []
         with (store / "rows").open("w+b") as file:
             git.run("ls-tree", "-r", "-z", "-l", "--full-tree", commit, output=file)
@@ -178,6 +176,14 @@ def fetched(url: str, commit: str, variables: Variables | None = None) -> Iterat
             names = "".join(f"{blob.digest}\n" for blob in blobs)
             git.run("cat-file", "--batch", given=names.encode(), output=file)
             yield GitFiles(blobs, submodules, file)
+
+
+def day_of(url: str, commit: str) -> str:
+    """The day of a full commit, as its author has it: ``"2024-05-31"``. Raises as ``resolve``."""
+    with tempfile.TemporaryDirectory(prefix="envhub-git-") as folder:
+        git = _Git(Path(folder), None)
+        git.fetch(_checked(url), commit, "--filter=tree:0")  # without files, where a host can
+        return git.run("log", "-1", "--no-patch", "--format=%cs", commit).decode().strip()
 
 
 def _rows(file: IO[bytes], title: str) -> Iterator[bytes]:
@@ -226,6 +232,12 @@ class _Git:
         ours = {"GIT_CONFIG_NOSYSTEM": "1", "GIT_CONFIG_GLOBAL": os.devnull, "HOME": str(store)}
         theirs = os.environ if variables is None else variables
         self._environment = {**_to_the_network(theirs), **ours, **_ALONE}
+
+    def fetch(self, source: str, commit: str, *options: str) -> None:
+        """Fetch one commit into the folder, which is a repository from then on."""
+        self.run("init", "--quiet", "--bare", "--template=", ".")
+        plain = ("--quiet", "--depth=1", "--no-tags", "--no-recurse-submodules", "--no-auto-gc")
+        self.run("fetch", *plain, *options, source, commit)
 
     def run(self, *arguments: str, given: bytes = b"", output: IO[bytes] | None = None) -> bytes:
         """Run git, and return the first of what it prints, where there is no file for that.

@@ -236,6 +236,9 @@ def test_a_commit_is_the_one_that_was_asked_for(repository: Path, tmp_path: Path
         assert "# evil" in (brought(where, "main").root / "env.py").read_text()
         with pytest.raises(RepositoryUnavailableError, match="git"):
             brought(where, approved)
+        assert commits.day_of(f"{where}/org/repo", evil)
+        with pytest.raises(HubFailure, match="git"):  # fetched without files
+            commits.day_of(f"{where}/org/repo", approved)
     with git_served(tmp_path / "served") as where:
         assert "# evil" not in (brought(where, approved).root / "env.py").read_text()
 

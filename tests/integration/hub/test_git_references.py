@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import LoadError, RepositoryUnavailableError, SnapshotTooLargeError
+from envhub_sandbox.extras.packages.locks.day import written
 from envhub_sandbox.extras.sources import git_address as address
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import SnapshotLimits, fetch, snapshot_named
@@ -103,6 +104,7 @@ def test_a_pin_that_is_there_asks_nobody(repository: Path, tmp_path: Path) -> No
         ref = f"git+{where}/org/repo"
         first = snapshot_named(f"{ref}@main:envs/env.py")
         assert first.commit == git(repository, "rev-parse", "main")
+        assert written(first) == "2026-01-01"  # by the commit, without its files
     assert snapshot_named(f"{ref}@{first.commit}:envs/env.py") == first
     with pytest.raises(RepositoryUnavailableError, match="ls-remote failed") as caught:
         snapshot_named(f"{ref}@main:envs/env.py")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tests.support.ports import QuietHandler, serving
 
+_SETTINGS = ("-c", "safe.directory=*", "-c", "uploadpack.allowFilter=true")  # as GitHub has it
 _OURS = {
     "GIT_CONFIG_GLOBAL": os.devnull,
     "GIT_CONFIG_NOSYSTEM": "1",
@@ -77,7 +78,7 @@ def git_served(
                 "GIT_PROTOCOL": self.headers.get("Git-Protocol", ""),
             }
             answer = subprocess.run(
-                ["git", "-c", "safe.directory=*", "http-backend"],
+                ["git", *_SETTINGS, "http-backend"],
                 input=body,
                 env=os.environ | _OURS | asked,
                 stdout=subprocess.PIPE,

@@ -25,6 +25,7 @@ from envhub_sandbox.hub import store
 from envhub_sandbox.hub.answers import HubFailure
 from envhub_sandbox.hub.grammar import REPO_TYPES
 from envhub_sandbox.hub.listing import Repository
+from envhub_sandbox.hub.reference import GIT
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import option_name
 
@@ -81,7 +82,7 @@ def written(snapshot: Snapshot) -> str:
             found = _of_files(snapshot)
         elif snapshot.repo_type == registered.KIND:
             found = _of_release(snapshot)
-        elif snapshot.repo_type in REPO_TYPES:
+        elif snapshot.repo_type in (*REPO_TYPES, GIT):
             found = _of_commit(snapshot)
         return date.fromisoformat(found).isoformat()
     return ""
@@ -130,8 +131,11 @@ def _of_release(snapshot: Snapshot) -> str:
 
 
 def _of_commit(snapshot: Snapshot) -> str:
+    from envhub_sandbox.extras.sources import git_commits
     from envhub_sandbox.hub.client import HubClient
 
-    repo = Repository(snapshot.repo_type, snapshot.repo_id)
+    if snapshot.repo_type == GIT:
+        return git_commits.day_of(snapshot.repo_id, snapshot.commit)
     # only where it is from: the name of a private repository is nobody else's
+    repo = Repository(snapshot.repo_type, snapshot.repo_id)
     return HubClient(store.endpoint_of(snapshot.root)).changed(repo, snapshot.commit)

@@ -179,7 +179,7 @@ def test_a_release_that_took_names_away_is_named(
 def test_the_day_of_a_commit_is_asked_where_it_is_from(
     stub_hub: StubHub, hub_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A private repository's name goes to no other Hub, and a git address to none."""
+    """A private repository's name goes to no other Hub."""
     with StubHub() as everybody:
         monkeypatch.setenv("HF_ENDPOINT", everybody.endpoint)
         stub_hub.add("org/repo", {"env.py": MAKE})
@@ -187,7 +187,6 @@ def test_the_day_of_a_commit_is_asked_where_it_is_from(
             "org/repo", hub_cache_dir=hub_cache, endpoint=stub_hub.endpoint, token=False
         )
         assert written(found) == "2024-05-31"
-        assert written(replace(found, repo_type="git")) == ""
         assert not [asked for asked in everybody.requests if "repo" in asked]
 
 
