@@ -23,7 +23,7 @@ from envhub_sandbox.sandboxes.sandbox import retry_while_busy
 from envhub_sandbox.session.builder import JailSource, SharedJail
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.launcher import ExpectedManifest, Launcher, LoadedJail
-from envhub_sandbox.session.prewarm import SuitePrewarm, TaskPrewarm
+from envhub_sandbox.session.prewarm import Prewarm, SuitePrewarm
 from envhub_sandbox.session.recorder import recorder_for
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import folders
@@ -205,7 +205,12 @@ class EnvFactory:
         self._cache.save(loaded.value)
         try:
             self._agrees(loaded.manifest)
-            if _is_used(loaded.manifest) and _was_played(loaded.manifest):
+            manifest = loaded.manifest
+            # environments live in the jail that describes them, unless each task has its own
+            is_used = not manifest.lazy or len(manifest.envs) == 1
+            if is_used and any(
+                e.shardable and not e.sync and e.num_envs > 1 for e in manifest.envs
+            ):
                 loaded = self._open_again(loaded, deadline)
             suites = self._suites(loaded.manifest, loaded)
             repository.warnings.show(repository.label)
@@ -236,11 +241,11 @@ class EnvFactory:
         if loaded is not None and shared is None:
             self._use(loaded, sessions)
         envs: dict[str, dict[Any, Any]] = {}
-        suites: dict[str, list[TaskPrewarm]] = {}
+        suites: dict[str, list[list[Prewarm]]] = {}
         for session, again in zip(sessions, makers, strict=True):
             env = session.manifest
             envs.setdefault(env.suite, {})[env.task] = SandboxVectorEnv(session, again)
-            suites.setdefault(env.suite, []).append(session.prewarm)
+            suites.setdefault(env.suite, []).append(session.prewarms)
         if shared is None and self._prewarm != 0:
             SuitePrewarm(list(suites.values()), self._prewarm)
         return EnvSuites(
@@ -294,18 +299,9 @@ class EnvFactory:
         """The jail that gave the manifest becomes the only task's; a suite closes it."""
         if len(sessions) == 1:
             with self._repository.named():
-                sessions[0].prewarm.adopt(loaded)
+                sessions[0].prewarms[0].adopt(loaded)
         else:
             self._launcher.close(loaded)
-
-
-def _is_used(manifest: Manifest) -> bool:
-    """Whether environments live in the jail that describes them: a suite's tasks have their own."""
-    return not manifest.lazy or len(manifest.envs) == 1
-
-
-def _was_played(manifest: Manifest) -> bool:
-    return any(env.shardable and not env.sync and env.num_envs > 1 for env in manifest.envs)
 
 
 def _each(launcher: Launcher, start: int, stop: int) -> Iterator[tuple[Launcher, tuple[int, int]]]:

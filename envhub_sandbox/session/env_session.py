@@ -88,6 +88,7 @@ class EnvSession:
 
             recovery = Recovery(lease, self._restarts, failures, recorder)
         self.prewarm = Prewarm(lease, use, recorder, recovery)
+        self.prewarms = [self.prewarm]
         self.requests = Requests(lease, use, self.prewarm, recorder, failures, recovery)
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
         if whole is None:
@@ -121,8 +122,8 @@ class EnvSession:
             return
         start, stop = self.rows
         alone = stop == start + 1
-        which = f"sub-environment {start}" if alone else f"sub-environments {start} to {stop - 1}"
-        position = f"({which} of {self.manifest.num_envs}, on {self.lease.place})"
+        rows = f"sub-environment {start}" if alone else f"sub-environments {start} to {stop - 1}"
+        position = f"({rows} of {self.manifest.num_envs}, on {self.lease.place})"
         if position not in str(error.args[0]):
             first, *rest = str(error.args[0]).split("\n")
             error.args = ("\n".join([f"{first} {position}", *rest]), *error.args[1:])
@@ -299,7 +300,7 @@ class EnvSession:
         """In a fork: touch nothing, and refuse all requests. interruption.md, rule 14."""
         self.use.abandon()
         self.lifecycle.moved(Event.FORK)
-        self.lifecycle.request = None
+        self.lifecycle.request = self.requests.stepping = None
         self.lease.abandon()
 
 

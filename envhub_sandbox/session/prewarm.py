@@ -146,7 +146,9 @@ class Prewarm:
 
     # --- the first use -------------------------------------------------------------------------
 
-    def on_first_use(self, first_use: Callable[[], None], make_room: Callable[[], bool]) -> None:
+    def on_first_use(
+        self, first_use: Callable[[], None] | None, make_room: Callable[[], bool]
+    ) -> None:
         """What to call at the first request, and where a server has no place left for it."""
         self.first_use, self._lease.make_room = first_use, make_room
 
@@ -157,57 +159,8 @@ class Prewarm:
             first_use()
 
 
-class FleetPrewarm:
-    """Starts the workers of one environment, side by side: see ``Prewarm``."""
-
-    def __init__(self, parts: Sequence[Prewarm]) -> None:
-        self._first_use: Callable[[], None] | None = None
-        self._parts = parts
-
-    @property
-    def closed(self) -> bool:
-        """Whether all parts are closed for good."""
-        return all(part.closed for part in self._parts)
-
-    @property
-    def starting(self) -> StartupDeadline | None:
-        """Of a part that is being started ahead."""
-        return next((part.starting for part in self._parts if part.starting is not None), None)
-
-    def adopt(self, loaded: LoadedJail) -> None:
-        """The first part uses a jail that is already loaded."""
-        self._parts[0].adopt(loaded)
-
-    def start_in_background(self) -> None:
-        """Each part in a thread of its own."""
-        for part in self._parts:
-            part.start_in_background()
-
-    def start(self) -> None:
-        """Likewise, and wait for them."""
-        from envhub_sandbox.system.threads import Calls  # which few need
-
-        Calls([part.start for part in self._parts]).wait()
-
-    def cancel(self) -> bool:
-        """Give up every part that was started ahead."""
-        cancelled = [part.cancel() for part in self._parts]
-        return any(cancelled)
-
-    def note_use(self) -> None:
-        """See ``Prewarm``."""
-        if self._first_use is not None:
-            first_use, self._first_use = self._first_use, None
-            first_use()
-
-    def on_first_use(self, first_use: Callable[[], None], make_room: Callable[[], bool]) -> None:
-        """See ``Prewarm``: whichever part is used first."""
-        self._first_use = first_use
-        for part in self._parts:
-            part.on_first_use(self.note_use, make_room)
-
-
-TaskPrewarm = Prewarm | FleetPrewarm
+_Task = tuple["weakref.ref[Prewarm]", ...]
+"""The workers of one environment; weak, for an environment without an owner is closed."""
 
 
 class SuitePrewarm:
@@ -215,27 +168,25 @@ class SuitePrewarm:
 
     Thread-safe. Each task is started in a thread of its own, so that where starting takes longer
     than playing, the next start begins while a request waits for the one before it.
-    ``suites``: the tasks of each suite, in order.
+    ``suites``: the tasks of each suite in order, each as its workers, of which most have one.
     ``count``: how many tasks after the last one are started ahead, and so how many unused jails
     there are at most. None: one, once tasks are seen to be closed before the next is used; so a use
     of just one task, or of all at once, starts nothing ahead.
     """
 
-    def __init__(self, suites: Sequence[Sequence[TaskPrewarm]], count: int | None) -> None:
+    def __init__(self, suites: Sequence[Sequence[Sequence[Prewarm]]], count: int | None) -> None:
         self._count = count
-        # weak: an environment without an owner is closed
-        self._suites = [[weakref.ref(task) for task in suite] for suite in suites]
-        for ref in chain.from_iterable(self._suites):
-            hash(ref)  # computed now and kept: it cannot be once the task has gone
+        self._suites = [[tuple(map(weakref.ref, task)) for task in suite] for suite in suites]
         self._lock = threading.Lock()
         self._cancelled = threading.Condition(self._lock)
-        self._wanted: list[weakref.ref[TaskPrewarm]] = []
-        self._tried: set[weakref.ref[TaskPrewarm]] = set()
-        self._ahead: list[weakref.ref[TaskPrewarm]] = []  # started here and not used yet
+        self._wanted: list[_Task] = []
+        self._tried: set[_Task] = set()
+        self._ahead: list[_Task] = []  # started here and not used yet
         self._cancelling = 0
-        for suite in suites:
-            for task in suite:
-                task.on_first_use(partial(self._used, weakref.ref(task)), self.make_room)
+        for task in chain.from_iterable(self._suites):
+            hash(task)  # computed now and kept: it cannot be once the workers have gone
+            for worker in _living(task):
+                worker.on_first_use(partial(self._used, task), self.make_room)
 
     def make_room(self) -> bool:
         """Cancel all unused starts, since a server has no place left; whether there were any."""
@@ -243,13 +194,15 @@ class SuitePrewarm:
             self._wanted = []
             ahead, self._ahead = self._ahead, []
             going = self._cancelling > 0
-        cancelled = [_cancel(task) for task in ahead]
+        cancelled = [worker.cancel() for task in ahead for worker in _living(task)]
         with self._lock:  # what other threads cancel makes room, too, once it has gone
             self._cancelled.wait_for(lambda: not self._cancelling, _GOING_S)
         return going or any(cancelled)
 
-    def _used(self, used: weakref.ref[TaskPrewarm]) -> None:
-        """A task has its first request."""
+    def _used(self, used: _Task) -> None:
+        """A task has its first request, to whichever of its workers."""
+        for worker in _living(used):
+            worker.first_use = None
         with self._lock:
             self._tried.add(used)
             self._ahead = [task for task in self._ahead if task != used]
@@ -273,7 +226,7 @@ class SuitePrewarm:
                 self._cancelled.notify_all()
                 return
 
-    def _following(self, used: weakref.ref[TaskPrewarm]) -> Iterator[weakref.ref[TaskPrewarm]]:
+    def _following(self, used: _Task) -> Iterator[_Task]:
         suite = next(suite for suite in self._suites if used in suite)
         index = suite.index(used)
         count = self._count
@@ -284,10 +237,16 @@ class SuitePrewarm:
         ]
         yield from [task for task in left if not _is_closed(task)][:count]
 
-    def _run(self, task: TaskPrewarm, start: bool) -> None:
+    def _run(self, task: list[Prewarm], start: bool) -> None:
         try:
             with contextlib.suppress(Exception):  # a request for it meets the same failure
-                task.start() if start else task.cancel()
+                if start and len(task) > 1:
+                    from envhub_sandbox.system.threads import Calls  # which few need
+
+                    Calls([worker.start for worker in task]).wait()
+                else:
+                    for worker in task:
+                        worker.start() if start else worker.cancel()
         finally:
             if not start:
                 with self._lock:
@@ -295,34 +254,30 @@ class SuitePrewarm:
                     self._start_threads()
                     self._cancelled.notify_all()
 
-    def _next(self) -> tuple[TaskPrewarm, bool] | None:
+    def _next(self) -> tuple[list[Prewarm], bool] | None:
         """What to cancel (False) or start (True).
 
         All that are passed over come first, and nothing starts before they have gone: so there are
         never more unused jails than the count.
         """
-        for ref in [task for task in self._ahead if task not in self._wanted]:
-            self._ahead.remove(ref)
-            self._tried.discard(ref)
-            task = ref()
-            if task is not None:
+        for task in [task for task in self._ahead if task not in self._wanted]:
+            self._ahead.remove(task)
+            self._tried.discard(task)
+            if workers := _living(task):
                 self._cancelling += 1
-                return task, False
+                return workers, False
         untried = [task for task in self._wanted if task not in self._tried]
-        for ref in [] if self._cancelling else untried:
-            task = ref()
-            self._tried.add(ref)
-            if task is not None:
-                self._ahead.append(ref)
-                return task, True
+        for task in [] if self._cancelling else untried:
+            self._tried.add(task)
+            if workers := _living(task):
+                self._ahead.append(task)
+                return workers, True
         return None
 
 
-def _is_closed(ref: weakref.ref[TaskPrewarm]) -> bool:
-    task = ref()
-    return task is None or task.closed
+def _living(task: _Task) -> list[Prewarm]:
+    return [worker for ref in task if (worker := ref()) is not None]
 
 
-def _cancel(ref: weakref.ref[TaskPrewarm]) -> bool:
-    task = ref()
-    return task is not None and task.cancel()
+def _is_closed(task: _Task) -> bool:
+    return all(worker.closed for worker in _living(task))

@@ -10,6 +10,7 @@ lifecycle moves before a message goes out and after its replies are in.
 
 from __future__ import annotations
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -33,6 +34,7 @@ from envhub_sandbox.session.recorder import Recorder
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.use_lock import FleetUse, UseLock
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline, deadline_of
+from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results, StepResult, all_replies
 from envhub_sandbox.transport.shard_trials import ENOUGH_STEPS
@@ -77,6 +79,7 @@ class RequestOrder(ABC):
         attributes: Those that need no request.
         use: A thread that asks something holds its lock until it has handled the answer;
             between an ``*_async`` and its ``*_wait`` no thread does.
+        stepping: The thread that is in a step, as far as it was not interrupted there.
         before_request, after_request: Called before each request, and once it was answered, where
             the caller has random generators of the environment.
     """
@@ -93,6 +96,7 @@ class RequestOrder(ABC):
         self.attributes = attributes
         self.closed = False
         self.waiting: str | None = None
+        self.stepping: int | None = None
         self.face = "SandboxVectorEnv"
         self.before_request: Callable[[], None] | None = None
         self.after_request: Callable[[], None] | None = None
@@ -100,6 +104,20 @@ class RequestOrder(ABC):
         self._unshown = repository.warnings.unshown
         self._timeouts = repository.timeouts
         self._step_deadline = StepDeadline(self._timeouts.step_s)
+        self._warned_of_two = False
+
+    def warn_of_two(self, thread: int) -> None:
+        """Warn, once, where another thread is in a step: both get results, of one another's."""
+        if self.stepping in (None, thread) or self._warned_of_two:
+            return
+        self._warned_of_two = True
+        warnings.warn(
+            f"{self._repository.label}: two threads step one environment at the same time. "
+            "The second waits for the first, and each continues the other's episodes: give each "
+            "thread an environment of its own, or hold a lock around reset and all its steps",
+            RuntimeWarning,
+            stacklevel=level_of_the_caller(),
+        )
 
     def refuse_if_busy(self, name: str) -> None:
         """Refuse a request while another waits for its ``*_wait``.

@@ -7,14 +7,12 @@ docs/internals/interruption.md, rules 10 to 12.
 from __future__ import annotations
 
 import threading
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.session.failures import Failures
 from envhub_sandbox.session.lease import Lease, closed_during
-from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_worker.protocol.errors import blamed, is_fault
 from envhub_worker.protocol.lifecycle import State
 
@@ -48,14 +46,11 @@ class UseLock:
             own thread waits for.
         flight: Held in ``send``, ``recv`` and ``reset``, taken before ``lock``: a ``recv`` holds
             only the locks of workers that owe something.
-        stepping: The thread that is in a step, as far as it was not interrupted there.
     """
 
     def __init__(self, lease: Lease, failures: Failures) -> None:
         self.lock = threading.RLock()  # interruption.md, rule 12
         self.flight = threading.RLock()
-        self.stepping: int | None = None
-        self._warned = False
         self._lease = lease
         self._failures = failures
 
@@ -80,19 +75,6 @@ class UseLock:
         self._lease.let_go()
         if isinstance(error, Exception) and not isinstance(error, WorkerDiedError):
             raise closed_during(operation) from error
-
-    def warn_of_two(self, thread: int) -> None:
-        """Warn, once, where another thread is in a step: both get results, of one another's."""
-        if self.stepping in (None, thread) or self._warned:
-            return
-        self._warned = True
-        warnings.warn(
-            f"{self._lease.repository.label}: two threads step one environment at the same time. "
-            "The second waits for the first, and each continues the other's episodes: give each "
-            "thread an environment of its own, or hold a lock around reset and all its steps",
-            RuntimeWarning,
-            stacklevel=level_of_the_caller(),
-        )
 
     @contextmanager
     def judging(self, operation: str) -> Iterator[None]:
@@ -121,16 +103,12 @@ class UseLock:
         """In a fork, which has not the thread that held the lock: interruption.md, rule 14."""
         self.lock = threading.RLock()
         self.flight = threading.RLock()
-        self.stepping = None
 
 
 class FleetUse:
-    """The use of all parts at a time, by one thread: see ``UseLock``.
-    ``stepping``: likewise.
-    """
+    """The use of all parts at a time, by one thread: see ``UseLock``."""
 
     def __init__(self, parts: Sequence[UseLock]) -> None:
-        self.stepping: int | None = None
         self._parts = parts
         self._holder: int | None = None
 
@@ -162,10 +140,3 @@ class FleetUse:
                 yield
             finally:
                 self._holder = before
-
-    def warn_of_two(self, thread: int) -> None:
-        """See ``UseLock``."""
-        first = self._parts[0]
-        first.stepping = self.stepping
-        first.warn_of_two(thread)
-        first.stepping = None

@@ -132,7 +132,8 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         first request.
         """
         self._requests.refuse_if_closed()
-        self._session.prewarm.start_in_background()
+        for prewarm in self._session.prewarms:
+            prewarm.start_in_background()
 
     # --- reset and step ------------------------------------------------------------------------
 
@@ -185,9 +186,9 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     def _note_first_use(self) -> None:
         """Before the lock, which a start ahead has: meanwhile the next one may start."""
         self._open_again()
-        prewarm = self._session.prewarm
-        if prewarm.starting is not None and not self.closed:
-            prewarm.note_use()
+        for prewarm in self._session.prewarms:
+            if prewarm.starting is not None and not self.closed:
+                prewarm.note_use()
 
     def _open_again(self) -> None:
         """Start again after a ``close``, with the same settings, where it serves LeRobot.
@@ -264,18 +265,18 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
             raise
 
     def _step(self, actions: Any) -> StepResult:
-        requests, use = self._requests, self._requests.use
-        if use.stepping is not None:
-            use.warn_of_two(get_ident())
-        with use.lock:
+        requests = self._requests
+        if requests.stepping is not None:
+            requests.warn_of_two(get_ident())
+        with requests.use.lock:
             try:
-                use.stepping = get_ident()
+                requests.stepping = get_ident()
                 if requests.closed or requests.waiting is not None:
                     requests.refuse_if_busy("step_async")
                 requests.submit_step(self._read_actions(actions))
                 return requests.collect_step(self._timeouts.step_s)
             finally:
-                use.stepping = None
+                requests.stepping = None
 
     @short_traceback
     def step_async(self, actions: Any) -> None:
@@ -314,11 +315,11 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     def _read(self, name: str) -> tuple[Any, ...]:
         """``call`` without arguments; what is read after each step is watched."""
         attributes = self._requests.attributes
-        known = attributes.get(name)
-        if isinstance(known, RemoteEnvError):
-            raise copy(known)
-        if known is not None:
-            return known
+        values = attributes.get(name)
+        if isinstance(values, RemoteEnvError):
+            raise copy(values)
+        if values is not None:
+            return values
         return self._watched(name) if attributes.should_watch(name) else self._called(name)
 
     def _watched(self, name: str) -> tuple[Any, ...]:
@@ -553,7 +554,8 @@ def _one_for_lerobot(recipe: Recipe, suite: str, task: int | str) -> SandboxVect
 
 def leave_suite(env: SandboxVectorEnv) -> None:
     """Have its first use start no other task of its suite: ``EnvSuites.map`` does that."""
-    env._session.prewarm.on_first_use(lambda: None, lambda: False)
+    for prewarm in env._session.prewarms:
+        prewarm.on_first_use(None, lambda: False)
 
 
 def refuse_limit(env: SandboxVectorEnv, steps: int | None) -> None:

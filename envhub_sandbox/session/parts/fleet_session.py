@@ -28,7 +28,6 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.session.counters import LEDGER, FleetCounters, Labels
 from envhub_sandbox.session.env_session import GRACE_S, EnvSession
 from envhub_sandbox.session.lease import AttributeCache
-from envhub_sandbox.session.prewarm import FleetPrewarm
 from envhub_sandbox.session.recorder import Recorder
 from envhub_sandbox.session.recovery import mark_revived
 from envhub_sandbox.session.requests import (
@@ -72,7 +71,7 @@ class FleetSession:
         self.bounds = [part.rows for part in parts]
         self.counters = FleetCounters([part.counters for part in parts])
         self.lifecycle = FleetLifecycle(parts)
-        self.prewarm = FleetPrewarm([part.prewarm for part in parts])
+        self.prewarms = [part.prewarm for part in parts]
         results = Results(manifest, self.bounds)
         results.max_bytes = self.repository.wire_limits.message_bytes
         self.requests = FleetRequests(self.parts, results, recorder, self.counters)
@@ -251,7 +250,8 @@ class FleetRequests(RequestOrder):
             count = self.results.manifest.num_envs
             self._each[0].refuse_whole(operation, message_for, count)
             raise
-        self._send(lambda at: self._each[at].submit_packed(operation, packed[at]))
+        pairs = zip(self._each, packed, strict=True)
+        self._send([partial(each.submit_packed, operation, request) for each, request in pairs])
         self._counters.requests += 1
         self._recorder.requested(_joined(packed, self.results.bounds))
 
@@ -260,23 +260,26 @@ class FleetRequests(RequestOrder):
     ) -> list[m.M]:
         """See ``Requests.collect``: the replies of all parts, in order."""
         deadline = deadline_of(timeout)
-        replies = self._of_all(lambda at: self._each[at].collect(deadline, kind))
+        replies = self._of_all([partial(each.collect, deadline, kind) for each in self._each])
         self.note_answered(kind)
-        return [reply for some in replies for reply in some]
+        return [*chain.from_iterable(replies)]
 
     def one_each(
         self, operation: str, replies: list[m.Value] | list[m.WatchDone]
     ) -> tuple[Any, ...]:
         """One value for each sub-environment; a part whose reply is none of these is given up."""
-        parts: list[list[Any]] = [[reply] for reply in replies]
-        values = self._of_all(lambda at: self._each[at].one_each(operation, parts[at]))
-        return tuple(value for some in values for value in some)
+        pairs: Any = zip(self._each, replies, strict=True)
+        values = self._of_all([partial(each.one_each, operation, [reply]) for each, reply in pairs])
+        return tuple(chain.from_iterable(values))
 
     def finish_reset(
         self, replies: list[m.ResetDone], timeout: float | Deadline | None
     ) -> tuple[Any, dict[Any, Any]]:
         """See ``Requests.finish_reset``."""
-        parts = self._of_all(lambda at: self._each[at].finish_reset([replies[at]], timeout))
+        pairs = zip(self._each, replies, strict=True)
+        parts = self._of_all(
+            [partial(each.finish_reset, [reply], timeout) for each, reply in pairs]
+        )
         try:
             result = self.results.joined_resets(parts)
         except batches.Misfit:
@@ -297,7 +300,8 @@ class FleetRequests(RequestOrder):
         rows = batches.split(self._space, actions, self.results.bounds)
         packed = self._packed(actions, rows) if self._may_not_fit else [None] * len(rows)
         self._sent_ns = perf_counter_ns()
-        self._send(lambda at: self._each[at].submit_step(rows[at], packed[at]))
+        steps = zip(self._each, rows, packed, strict=True)
+        self._send([partial(each.submit_step, *own) for each, *own in steps])
         self._counters.requests += 1
         self._recorder.step(actions)
 
@@ -322,7 +326,8 @@ class FleetRequests(RequestOrder):
             deadline = deadline_of(timeout)
         # in turns, so that each worker is waited for as often before the others as after them
         self._first = (self._first + 1) % len(self._each)
-        parts = self._of_all(partial(self._collect_step, deadline), self._first)
+        waits = [partial(self._collect_step, deadline, at) for at in range(len(self._each))]
+        parts = self._of_all(waits, self._first)
         self._counters.stepped(perf_counter_ns() - self._sent_ns)
         try:
             result = self.results.joined_steps(parts)
@@ -340,11 +345,12 @@ class FleetRequests(RequestOrder):
 
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
         """The last infos once more, of all parts: theirs do not fit together."""
-        own = self._of_all(lambda at: self._each[at].checked_own_infos(deadline))
+        asks = [partial(each.checked_own_infos, deadline) for each in self._each]
+        own = self._of_all(asks)
         try:
-            infos = self.results.joined_own([reply for some in own for reply in some])
+            infos = self.results.joined_own([*chain.from_iterable(own)])
         except RemoteEnvError:
-            self._of_all(lambda at: self._each[at].checked_own_infos(deadline, failed=True))
+            self._of_all([partial(ask, failed=True) for ask in asks])
             raise
         pairs = zip(self._each, self.results.bounds, strict=True)
         fresh = [bounds for requests, bounds in pairs if requests.came_back]
@@ -389,12 +395,12 @@ class FleetRequests(RequestOrder):
         if not self._starting.wait(_ENDS_S):
             raise WorkerTimeoutError("processes are still being started; call reset() again")
 
-    def _send(self, send: Callable[[int], None]) -> None:
+    def _send(self, sends: Sequence[Callable[[], None]]) -> None:
         """Send each part its own. Where one fails after others were sent theirs, it is noted."""
         self._unsent = {}
-        for at in range(len(self._parts)):
+        for at, send in enumerate(sends):
             try:
-                send(at)
+                send()
             except Exception as error:
                 if at == 0:
                     with self._parts[at].naming():
@@ -402,18 +408,18 @@ class FleetRequests(RequestOrder):
                 self._unsent[at] = error
                 self._each[at].fall_behind()
 
-    def _of_all(self, take: Callable[[int], T], first: int = 0) -> list[T]:
+    def _of_all(self, calls: Sequence[Callable[[], T]], first: int = 0) -> list[T]:
         """What each part gives. Every one is waited for; then the first failure is raised.
 
         See interruption.md, rule 17.
         """
         failures, self._unsent = self._unsent, {}
         taken: dict[int, T] = {}
-        count = len(self._parts)
+        count = len(calls)
         for at in chain(range(first, count), range(first)):
             if at not in failures:
                 try:
-                    taken[at] = take(at)
+                    taken[at] = calls[at]()
                 except Exception as error:
                     failures[at] = error
         if failures:
@@ -422,11 +428,11 @@ class FleetRequests(RequestOrder):
 
     def _fail(self, failures: dict[int, Exception]) -> None:
         # a death or a late reply first, as where the workers are processes of one jail
-        first = min(failures, key=lambda at: (not isinstance(failures[at], WorkerError), at))
-        for at, error in failures.items():
-            if at != first:
-                WORKER.info("%s: also: %s", self._repository.label, error)
-        error = failures[first]
+        fatal = [at for at, error in failures.items() if isinstance(error, WorkerError)]
+        first = min(fatal or failures)
+        error = failures.pop(first)
+        for other in failures.values():
+            WORKER.info("%s: also: %s", self._repository.label, other)
         try:
             with self._parts[first].naming():
                 raise error

@@ -190,7 +190,7 @@ class _Task:
 def suite_of(count: int, ahead: int | None = 1) -> list[_Task]:
     """Tasks, of which so many are started ahead."""
     tasks = [_Task() for _ in range(count)]
-    SuitePrewarm([cast("list[Prewarm]", tasks)], ahead)
+    SuitePrewarm([[[cast("Prewarm", task)] for task in tasks]], ahead)
     return tasks
 
 
