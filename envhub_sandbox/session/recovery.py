@@ -6,7 +6,7 @@ others go on. Without it there is no ``Recovery``, and a death is an error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,10 +34,6 @@ _SETTINGS = 256
 """Attributes that are remembered, the last ones."""
 _SETTERS = frozenset({"__setattr__", "set_wrapper_attr"})
 """Methods of sub-environments that set an attribute."""
-MessagesFor = Callable[["Lane", int], list[m.Message]]
-"""Makes what a shard's fresh runner is asked, one after the other."""
-RowsOf = Callable[[m.Message, int], m.Message]
-"""Makes the reply for a dead shard of a fresh runner's last answer and the number of rows."""
 
 
 class Recovery:
@@ -107,12 +103,12 @@ class Recovery:
         if self._lifecycle.request != "reset":
             self._lifecycle.answered()
             raise deaths.first
-        return self._revive(replies, deaths, "reset", self._resets, _reset_rows)
+        return self._revive(replies, deaths, "reset")
 
     def survive_step(self, deaths: RunnersDiedError) -> list[m.StepDone]:
         """The replies to a step, with truncated rows in the place of the dead."""
         replies = self._of_survivors(deaths)
-        merged = self._revive(replies, deaths, "step", self._revivals, _step_rows)
+        merged = self._revive(replies, deaths, "step")
         return [typed_reply(reply, m.StepDone) for reply in merged]
 
     def mark(self, infos: dict[Any, Any]) -> dict[Any, Any]:
@@ -136,12 +132,7 @@ class Recovery:
         return deaths.replies
 
     def _revive(
-        self,
-        replies: list[m.Message | None],
-        deaths: RunnersDiedError,
-        operation: str,
-        messages_for: MessagesFor,
-        rows_of: RowsOf,
+        self, replies: list[m.Message | None], deaths: RunnersDiedError, operation: str
     ) -> list[m.Message]:
         """Have the dead shards brought back, and move on to the state that it leads to; ``replies``
         with those of the fresh runners.
@@ -150,11 +141,9 @@ class Recovery:
         lifecycle.moved(Event.LOSS)
         failures.keep_crash(deaths.first)
         try:
-            answers = self._bring_back(deaths, operation, messages_for)
+            answers = self._bring_back(deaths, operation)
             with UNTRUSTED:
-                fresh = {
-                    index: rows_of(answer, self._size(index)) for index, answer in answers.items()
-                }
+                fresh = {at: self._revived(at, operation, answers[at]) for at in answers}
         except WorkerTimeoutError as error:
             if lifecycle.closed:
                 raise failures.dead(error) from error
@@ -177,9 +166,7 @@ class Recovery:
         merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
         return [reply for reply in merged if reply is not None]
 
-    def _bring_back(
-        self, deaths: RunnersDiedError, operation: str, messages_for: MessagesFor
-    ) -> dict[int, m.Message]:
+    def _bring_back(self, deaths: RunnersDiedError, operation: str) -> dict[int, m.Message]:
         """What the fresh runners answer to the last of their requests."""
         if any(death.reason == "protocol" for death in deaths.deaths.values()):
             raise deaths.first  # after a broken rule there is no second chance
@@ -202,7 +189,13 @@ class Recovery:
         assert lane is not None
         try:
             self._set_again(lane, dead, deadline_of_reset)
-            return _ask_anew(lane, dead, messages_for, deadline_of_reset)
+            replies: list[m.Message] = []
+            each = [self._messages(lane, index, operation) for index in dead]
+            for messages in zip(*each, strict=True):
+                runners = [lane.runners[index] for index in dead]
+                requests = [*zip(runners, messages, strict=True)]
+                replies = lane.jail.exchange("reset", requests, deadline_of_reset)
+            return dict(zip(dead, replies, strict=True))
         except WorkerTimeoutError as error:
             raise self._failures.late("reset", deadline_of_reset) from error
 
@@ -220,20 +213,22 @@ class Recovery:
                 if not isinstance(reply, m.RaisedException):
                     typed_reply(reply, m.Value)
 
-    def _revivals(self, lane: Lane, index: int) -> list[m.Message]:
-        return [m.Revive(lane.number, self._derived(index))]
-
-    def _resets(self, lane: Lane, index: int) -> list[m.Message]:
+    def _messages(self, lane: Lane, index: int, operation: str) -> list[m.Message]:
+        """What a shard's fresh runner is asked, one after the other."""
+        seeds = self._seeds.derived(self._bounds[index], self._counters.restarts)
+        if operation == "step":
+            return [m.Revive(lane.number, seeds)]
         reset = self._asked[index]
         assert isinstance(reset, m.Reset)
-        return resets(reset, self._derived(index))
+        return resets(reset, seeds)
 
-    def _derived(self, index: int) -> Any:
-        return self._seeds.derived(self._bounds[index], self._counters.restarts)
-
-    def _size(self, index: int) -> int:
+    def _revived(self, index: int, operation: str, answer: m.Message) -> m.Message:
+        """The reply for a dead shard, made of its fresh runner's. Trust: input from the worker."""
         start, stop = self._bounds[index]
-        return stop - start
+        if operation == "step":
+            return revived_step(typed_reply(answer, m.StepDone), stop - start)
+        done = typed_reply(answer, m.ResetDone)
+        return m.replace(done, info=mark_revived(done.info, stop - start))
 
 
 def _target_of(messages: Sequence[m.Message]) -> tuple[Any, ...] | None:
@@ -249,27 +244,6 @@ def _target_of(messages: Sequence[m.Message]) -> tuple[Any, ...] | None:
         return None
     targets = [(getattr(call, "index", None), getattr(call, "depth", None)) for call in calls]
     return (args[0], calls[0].name, *targets)
-
-
-def _step_rows(reply: m.Message, size: int) -> m.Message:
-    """Trust: input from the worker."""
-    return revived_step(typed_reply(reply, m.StepDone), size)
-
-
-def _reset_rows(reply: m.Message, size: int) -> m.Message:
-    """Trust: input from the worker."""
-    done = typed_reply(reply, m.ResetDone)
-    return m.replace(done, info=mark_revived(done.info, size))
-
-
-def _ask_anew(
-    lane: Lane, dead: Sequence[int], messages_for: MessagesFor, deadline: Deadline
-) -> dict[int, m.Message]:
-    replies: list[m.Message] = []
-    for messages in zip(*(messages_for(lane, index) for index in dead), strict=True):
-        requests = [(lane.runners[i], message) for i, message in zip(dead, messages, strict=True)]
-        replies = lane.jail.exchange("reset", requests, deadline)
-    return dict(zip(dead, replies, strict=True))
 
 
 def revived_step(reply: m.StepDone, count: int) -> m.StepDone:
