@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.vector.single_env import info_of
+from envhub_sandbox.vector.sub_environment import metadata_of_one
 from envhub_sandbox.vector.suites import choose, closed_if_it_fails
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.codec.inert import RemoteObject
@@ -56,8 +57,7 @@ class SandboxVecEnv(VecEnv):
         super().__init__(
             vector.num_envs, vector.single_observation_space, vector.single_action_space
         )
-        metadata = vector.metadata.items()  # the mode is a vector environment's alone
-        self.metadata = {key: value for key, value in metadata if key != "autoreset_mode"}
+        self.metadata = metadata_of_one(vector)
 
     @classmethod
     def make(
@@ -240,7 +240,7 @@ def _batch_of(space: spaces.Space[Any], members: Any) -> Any:
         return {key: _batch_of(sub, [m[key] for m in members]) for key, sub in space.items()}
     if isinstance(space, spaces.Tuple):
         each = enumerate(space.spaces)
-        return tuple(_batch_of(sub, [m[place] for m in members]) for place, sub in each)
+        return tuple(_batch_of(sub, [m[index] for m in members]) for index, sub in each)
     return members
 
 

@@ -188,7 +188,7 @@ class Results:
         Trust: input from the worker.
         """
         places = sorted(key for key in infos if type(key) is int and key >= 0)
-        which, reward = infos.get(batches.APART_SCALARS, ()), infos.get(batches.APART_REWARD, ())
+        scalars, reward = infos.get(batches.APART_SCALARS, ()), infos.get(batches.APART_REWARD, ())
         if type(reward) is not tuple or len(reward) > 1:
             raise RemoteProtocolError("the worker sent more than one reward")
         own: list[list[dict[Any, Any]]] = [[] for _ in range(self.count)]
@@ -196,13 +196,13 @@ class Results:
             if type(infos[index]) is not dict or index >= 2 * self.count:
                 raise RemoteProtocolError(_NOT_ONE_EACH)
             own[index % self.count].append(infos[index])
-        if type(which) is not tuple:
+        if type(scalars) is not tuple:
             raise RemoteProtocolError(_NOT_ONE_EACH)
         for key in infos:  # marks of ours: which were lost and came back
             if f"_{key}" in infos:
                 for at in np.flatnonzero(infos[f"_{key}"]):
                     own[at] = [*own[at][:-1], {**(own[at] or [{}])[-1], key: True}]
-        return own, which, reward
+        return own, scalars, reward
 
     def _restored(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         final = infos.get("final_obs") if self._restores else None
@@ -218,10 +218,10 @@ class Results:
         """
         if reply is None:
             return {}
-        [said] = all_replies([reply], m.Value)
-        if type(said.value) is not dict:
+        [answer] = all_replies([reply], m.Value)
+        if type(answer.value) is not dict:
             raise RemoteProtocolError("the worker's infos are not a mapping")
-        return said.value
+        return answer.value
 
     def one_each(self, operation: str, replies: Sequence[m.Value | m.WatchDone]) -> tuple[Any, ...]:
         """One value for each sub-environment."""

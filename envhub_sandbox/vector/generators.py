@@ -135,8 +135,8 @@ class Generators:
             else:
                 states = self._requests.one_each("np_random", replies)
             fetched = [_read(state) for state in states]
-            known = self._live or fetched
-            self._live = [_followed(old, new) for old, new in zip(known, fetched, strict=True)]
+            pairs = zip(self._live or fetched, fetched, strict=True)
+            self._live = [_followed(old, new) for old, new in pairs]
         self._current = True
         self._requests.before_request = self.before_request
         self._requests.after_request = self.after_request

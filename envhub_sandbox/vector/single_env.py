@@ -21,6 +21,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from envhub_sandbox.errors import ActionError
 from envhub_sandbox.vector.sandbox_view import SandboxView
+from envhub_sandbox.vector.sub_environment import metadata_of_one
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.errors import UNTRUSTED
@@ -67,11 +68,10 @@ class SingleEnv(gym.Env[Any, Any]):
         self._begun: tuple[Any, dict[str, Any]] | None = None
         # as they were declared: the caller may set others
         self._observations = vector.single_observation_space, vector.observation_space
-        items = vector.metadata.items()  # the mode is a vector environment's alone
         self.__dict__.update(  # not by __setattr__, which sets them in the environment as well
             observation_space=vector.single_observation_space,
             action_space=vector.single_action_space,
-            metadata={key: value for key, value in items if key != "autoreset_mode"},
+            metadata=metadata_of_one(vector),
             render_mode=vector.render_mode,
         )
         mode = getattr(vector.metadata.get("autoreset_mode"), "value", None)
@@ -117,8 +117,8 @@ class SingleEnv(gym.Env[Any, Any]):
         else:
             batch, infos = self._vector.reset(seed=seed, options=options)
         with UNTRUSTED:
-            [info, *_], which, _ = self._own(infos)
-            return self._first(batch, which), info
+            [info, *_], scalars, _ = self._own(infos)
+            return self._first(batch, scalars), info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """One step with ``action``, an element of ``action_space``.
@@ -148,8 +148,8 @@ class SingleEnv(gym.Env[Any, Any]):
         self, batch: Any, rewards: Any, terminations: Any, truncations: Any, infos: Any
     ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """What a step of the only one returns."""
-        [info, *more], which, odd = self._own(infos)
-        observation = self._first(batch, which)
+        [info, *more], scalars, odd = self._own(infos)
+        observation = self._first(batch, scalars)
         terminated, truncated = bool(terminations[0]), bool(truncations[0])
         if (terminated or truncated) and self._resets_in_the_same_step:
             last, last_info = info.pop("final_obs"), info.pop("final_info", {})
@@ -289,11 +289,7 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # copy and deepcopy, too: another one like it, with processes of its own
-        return type(self)._like, (self._vector,)
-
-    @classmethod
-    def _like(cls, vector: VectorEnv[Any, Any, Any]) -> SingleEnv:
-        return SingleEnv(vector)
+        return SingleEnv, (self._vector,)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} of {self._vector!r}>"
@@ -319,12 +315,12 @@ class SingleEnv(gym.Env[Any, Any]):
             return array[None]
         return concatenate(space, [action], cast("Any", create_empty_array(space, 1)))
 
-    def _first(self, batch: Any, which: Sequence[bool]) -> Any:
-        """The only observation; its discrete members of the class that they had there."""
+    def _first(self, batch: Any, scalars: Sequence[bool]) -> Any:
+        """The only observation; ``scalars`` says which discrete members were numbers of Python."""
         [first, *_] = batches.members(*self._observations, batch, 1)
-        if True not in which:
+        if True not in scalars:
             return first
-        return batches.with_integers(self._observations[0], first, iter(which))
+        return batches.with_integers(self._observations[0], first, iter(scalars))
 
     def _own(
         self, infos: dict[Any, Any]
@@ -334,8 +330,8 @@ class SingleEnv(gym.Env[Any, Any]):
             return [info_of(infos, 0, 1)], (), ()
         if not infos:
             return [{}, {}], (), ()
-        [own], which, reward = self._apart.own(infos)
-        return [*own, {}, {}], which, reward
+        [own], scalars, reward = self._apart.own(infos)
+        return [*own, {}, {}], scalars, reward
 
 
 def info_of(infos: dict[Any, Any], index: int, num_envs: int) -> dict[Any, Any]:

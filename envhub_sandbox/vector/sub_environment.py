@@ -30,6 +30,20 @@ nested calls, which a step through the wrappers makes."""
 _OURS = frozenset({"_vector", "_index", "_depth"})
 
 
+def _declared(name: str, vector_name: str) -> Any:
+    """What is known of the first one without a request: the vector environment shows it."""
+
+    def declared(env: SubEnvironment) -> Any:
+        return getattr(env._vector, vector_name) if env._is_shown else env._get(name)
+
+    return property(declared)
+
+
+def metadata_of_one(vector: Any) -> dict[str, Any]:
+    """Without the autoreset mode, which is a vector environment's alone."""
+    return {key: value for key, value in vector.metadata.items() if key != "autoreset_mode"}
+
+
 class SubEnvironment(gym.Env[Any, Any]):
     """One sub-environment of a vector environment, and what its wrappers wrap.
 
@@ -99,30 +113,15 @@ class SubEnvironment(gym.Env[Any, Any]):
             return wrapped
         return SubEnvironment(self._vector, self._index, self._depth + 1)
 
-    @property
-    def action_space(self) -> Any:  # type: ignore[override]
-        """Its action space; a copy, but for the first one's, which is the vector environment's."""
-        return self._vector.single_action_space if self._is_shown else self._get("action_space")
-
-    @property
-    def observation_space(self) -> Any:  # type: ignore[override]
-        """Its observation space; as ``action_space``."""
-        if self._is_shown:
-            return self._vector.single_observation_space
-        return self._get("observation_space")
+    # a copy, but for the first one's, which is the vector environment's own
+    action_space = _declared("action_space", "single_action_space")
+    observation_space = _declared("observation_space", "single_observation_space")
+    render_mode = _declared("render_mode", "render_mode")
 
     @property
     def metadata(self) -> Any:  # type: ignore[override]
         """Its metadata."""
-        if not self._is_shown:
-            return self._get("metadata")
-        shown = self._vector.metadata.items()  # the mode is the vector environment's alone
-        return {key: value for key, value in shown if key != "autoreset_mode"}
-
-    @property
-    def render_mode(self) -> Any:  # type: ignore[override]
-        """As in Gymnasium."""
-        return self._vector.render_mode if self._is_shown else self._get("render_mode")
+        return metadata_of_one(self._vector) if self._is_shown else self._get("metadata")
 
     @property
     @short_traceback

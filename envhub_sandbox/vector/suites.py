@@ -117,12 +117,10 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
             Exception: The first that ``play`` raised. The tasks that were being played have ended,
                 no other was started, and all are closed.
         """
-        each = [env for tasks in self.values() for env in tasks.values()]
-        sizes = [env.sandbox.memory_limit() for env in each if isinstance(env, SandboxVectorEnv)]
+        sizes = [env.sandbox.memory_limit() for env in _sandboxed(self)]
         live = live_tasks(memory, max_live_tasks, max(sizes, default=0))
-        for env in each:
-            if isinstance(env, SandboxVectorEnv):
-                leave_suite(env)
+        for env in _sandboxed(self):
+            leave_suite(env)
         return TaskMap(self, play, live).run()
 
     def _repr_html_(self) -> str:
@@ -132,10 +130,10 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
 
     def close(self) -> None:
         """Close every environment and end its processes. Idempotent."""
-        with contextlib.ExitStack() as all_of_them:  # interruption.md, rule 9
-            all_of_them.callback(self._on_close)
-            for env in [env for tasks in self.values() for env in tasks.values()][::-1]:
-                all_of_them.callback(env.close)
+        with contextlib.ExitStack() as stack:  # interruption.md, rule 9
+            stack.callback(self._on_close)
+            for env in _each(self)[::-1]:
+                stack.callback(env.close)
 
     def __enter__(self) -> EnvSuites:
         return self
@@ -147,6 +145,14 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         traceback: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def _each(suites: Envs) -> list[VectorEnv[Any, Any, Any]]:
+    return [env for tasks in suites.values() for env in tasks.values()]
+
+
+def _sandboxed(suites: Envs) -> list[SandboxVectorEnv]:
+    return [env for env in _each(suites) if isinstance(env, SandboxVectorEnv)]
 
 
 @contextlib.contextmanager
@@ -161,9 +167,8 @@ def closed_if_it_fails(suites: EnvSuites) -> Iterator[EnvSuites]:
 
 def for_lerobot(suites: EnvSuites) -> EnvSuites:
     """The same, for LeRobot's programs: see ``serve_lerobot``."""
-    for env in [env for tasks in suites.values() for env in tasks.values()]:
-        if isinstance(env, SandboxVectorEnv):
-            serve_lerobot(env)
+    for env in _sandboxed(suites):
+        serve_lerobot(env)
     suites._serves_lerobot = True
     return suites
 
@@ -180,12 +185,12 @@ def choose(
     Raises:
         ValueError: There is not exactly one; the text names what there is.
     """
-    chosen = _named(suites, suite, lambda task_id: task in (None, task_id))
+    chosen = _named(suites, suite, (task,))
     if len(chosen) == 1:
         return suites[chosen[0][0]][chosen[0][1]]
     if chosen:
         raise ValueError(f"there are {len(chosen)} environments; choose one: {_names(chosen)}")
-    available = _names(_named(suites, None, lambda _: True))
+    available = _names(_named(suites))
     named = [("suite", suite), ("task", task)]
     wanted = " with a ".join(f"{word} {name!r}" for word, name in named if name is not None)
     raise ValueError(f"there is no {wanted}; there are: {available}")
@@ -197,7 +202,8 @@ def keep_only(suites: EnvSuites, suite: str | None = None, task: int | str | Non
     Raises:
         ValueError: Nothing would be left; the text names what there is.
     """
-    chosen = _named(suites, suite, lambda task_id: task in (None, task_id, str(task_id)))
+    ids = [task_id for _, task_id in _named(suites, suite) if task in (task_id, str(task_id))]
+    chosen = _named(suites, suite, (task, *ids))
     if not chosen:
         choose(suites, suite, task)
     for a_suite, tasks in list(suites.items()):
@@ -208,10 +214,11 @@ def keep_only(suites: EnvSuites, suite: str | None = None, task: int | str | Non
 
 
 def _named(
-    suites: EnvSuites, suite: str | None, is_meant: Callable[[int | str], bool]
+    suites: EnvSuites, suite: str | None = None, tasks: tuple[int | str | None, ...] = (None,)
 ) -> list[tuple[str, int | str]]:
-    meant = [(name, tasks) for name, tasks in suites.items() if suite in (None, name)]
-    return [(name, task) for name, tasks in meant for task in tasks if is_meant(task)]
+    """The names of what is in this suite, or in any, and has one of these tasks' ids, or any."""
+    named = [(name, task) for name in suites for task in suites[name] if suite in (None, name)]
+    return named if None in tasks else [pair for pair in named if pair[1] in tasks]
 
 
 def _names(tasks: list[tuple[str, int | str]]) -> str:
@@ -277,10 +284,10 @@ class TaskMap(Generic[T]):
                 Calls([self._run] * self._threads).wait()
             except BaseException as error:  # a Ctrl-C: requests in other threads end with a close
                 self._failure = error
-                self._close_all()
-                raise
         if self._failure is not None:
-            self._close_all()
+            with contextlib.ExitStack() as stack:  # interruption.md, rule 9
+                for env in _each(self._suites):
+                    stack.callback(env.close)
             raise self._failure
         return {
             suite: {task: self._results[suite, task] for task in tasks}
@@ -290,13 +297,13 @@ class TaskMap(Generic[T]):
     def _run(self) -> None:
         """In each thread."""
         try:
-            while (next_one := self._next()) is not None:
-                suite, task = next_one
+            while (next_task := self._next()) is not None:
+                suite, task = next_task
                 env = self._suites[suite][task]
                 result = self._play(suite, task, env)
                 env.close()
                 with self._lock:
-                    self._results[next_one] = result
+                    self._results[next_task] = result
                     self._tell(f"{len(self._results)} of {self._total} done, last {suite} {task}")
         except BaseException as error:
             with self._lock:
@@ -306,16 +313,10 @@ class TaskMap(Generic[T]):
         with self._lock:
             if self._failure is not None or not self._left:
                 return None
-            found = self._left.popleft()
+            next_task = self._left.popleft()
             if self._ahead and self._left:
                 suite, task = self._left[0]
                 following = self._suites[suite][task]
                 if hasattr(following, "prewarm"):  # one of this process has nothing to start
                     following.prewarm()
-            return found
-
-    def _close_all(self) -> None:
-        with contextlib.ExitStack() as all_of_them:  # interruption.md, rule 9
-            for tasks in self._suites.values():
-                for env in tasks.values():
-                    all_of_them.callback(env.close)
+            return next_task
