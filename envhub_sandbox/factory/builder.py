@@ -57,8 +57,8 @@ def _built(folder: Path, order: Mapping[str, Any]) -> dict[str, Any]:
     with EnvFactory([launcher], 1, 0, lambda manifest: None).make() as suites:
         env = suites.env
         names = ("packages", "python", "backend", "backend_path", "known", "environment")
-        asked = {name: order[name] for name in names}
-        [reply] = env.call("build", {**asked, "source": order["source"], "tools": str(tools)})
+        build_order = {name: order[name] for name in (*names, "source")}
+        [reply] = env.call("build", {**build_order, "tools": str(tools)})
         if not isinstance(reply, dict):
             return {"failed": f"it answered {type(reply).__name__}"}
         if "wheel" not in reply:

@@ -128,34 +128,34 @@ def make_env(
             (``ServerBusyError``).
         RuntimeError: ``sandbox=None`` without ``trust_remote_code=True``.
     """
-    given = locals().copy()  # the arguments, as long as nothing else has a name here
-    return _make(given.pop("cfg"), Options(**given))
+    arguments = locals().copy()  # only these, as long as nothing else has a name here
+    return _make(arguments.pop("cfg"), Options(**arguments))
 
 
-def _make(cfg: Any, given: Options) -> EnvSuites:
+def _make(cfg: Any, unchecked: Options) -> EnvSuites:
     reference, config = reference_of(cfg)
-    options = given.checked()
+    options = unchecked.checked()
     if options.sandbox is None:
         return _make_here(reference, config, options)
     occupy_streams()  # before anything of ours is opened
-    wanted = _wanted(options.sandbox, options)
+    plan = _plan(options.sandbox, options)
     snapshot = snapshot_named(reference, **options.source)
-    snapshot = with_assets(snapshot, options.assets, options.hub, wanted.source.assets)
-    target = wanted.place.package_target()
+    snapshot = with_assets(snapshot, options.assets, options.hub, plan.source.assets)
+    target = plan.sandbox.package_target()
     while True:
         try:
-            suites = _suites(snapshot, config, wanted, options)
+            suites = _suites(snapshot, config, plan, options)
             break
         except DependencyError as error:
-            if error.reason != "module" or not wanted.source.note(snapshot, target, str(error)):
+            if error.reason != "module" or not plan.source.note(snapshot, target, str(error)):
                 raise
     return for_lerobot(suites) if options.trust_remote_code else suites
 
 
-def _suites(snapshot: Snapshot, config: Any, wanted: _Plan, options: Options) -> EnvSuites:
+def _suites(snapshot: Snapshot, config: Any, plan: _Plan, options: Options) -> EnvSuites:
     """The environments of a snapshot. Raises ``DependencyError``."""
-    target, gpu = wanted.place.package_target(), bool(wanted.policy.gpu)
-    packages = wanted.source.packages(snapshot, target, gpu=gpu)
+    target, gpu = plan.sandbox.package_target(), bool(plan.policy.gpu)
+    packages = plan.source.packages(snapshot, target, gpu=gpu)
     load = m.Load(
         n_envs=options.n_envs,
         use_async_envs=options.use_async_envs,
@@ -168,62 +168,57 @@ def _suites(snapshot: Snapshot, config: Any, wanted: _Plan, options: Options) ->
         config=load.cfg,
         options=options.for_a_recipe(
             env_kwargs=load.env_kwargs,
-            assets=tuple(one.pinned for one in snapshot.assets),
-            policy=wanted.policy,
-            timeouts=wanted.timeouts,
-            python=wanted.source.python,
-            dependencies="auto" if wanted.source.python is not None else options.dependencies,
+            assets=tuple(asset.pinned for asset in snapshot.assets),
+            policy=plan.policy,
+            timeouts=plan.timeouts,
+            python=plan.source.python,
+            dependencies="auto" if plan.source.python is not None else options.dependencies,
         ),
     )
-
-    def advice(said: str) -> str:
-        return wanted.source.advice(
-            snapshot, wanted.place.name, own=packages is not None, said=said
-        )
 
     repository = Repository(
         snapshot,
         load,
-        wanted.policy,
-        wanted.timeouts,
-        Runtime(packages.python, packages.packages) if packages else wanted.runtime,
+        plan.policy,
+        plan.timeouts,
+        Runtime(packages.python, packages.packages) if packages else plan.runtime,
         options.copy,
         min_ready=options.min_ready,
         recipe=recipe,
         installed=packages.facts if packages else None,
-        advice=advice,
-        of_its_day=partial(wanted.source.of_its_day, snapshot, target),
+        advice=partial(plan.source.advice, snapshot, plan.sandbox.name, packages is not None),
+        of_its_day=partial(plan.source.of_its_day, snapshot, target),
     )
     return EnvFactory(
-        _launchers(repository, wanted.place, options),
+        _launchers(repository, plan.sandbox, options),
         options.num_workers,
-        _ahead(wanted, options),
-        lambda manifest: wanted.source.check(manifest, snapshot.label, load.env_kwargs, config),
+        _ahead(plan, options),
+        lambda manifest: plan.source.check(manifest, snapshot.label, load.env_kwargs, config),
     ).make()
 
 
-def _launchers(repository: Repository, place: Sandbox, options: Options) -> list[Launcher]:
+def _launchers(repository: Repository, sandbox: Sandbox, options: Options) -> list[Launcher]:
     """One for each worker with a jail of its own."""
     store, apart = cache_root() / "snapshots", options.min_ready is not None
     count = options.num_workers or (options.n_envs if apart else None)
-    found = [Launcher(repository, one, store) for one in place.workers(count)]
-    if apart and len(found) == 1 and count is not None:
-        found += [found[0].another() for _ in range(1, count)]
-    return found
+    launchers = [Launcher(repository, seat, store) for seat in sandbox.workers(count)]
+    if apart and len(launchers) == 1 and count is not None:
+        launchers += [launchers[0].another() for _ in range(1, count)]
+    return launchers
 
 
 @dataclass(frozen=True)
 class _Plan:
     """What was asked for, looked at before anything is fetched or started."""
 
-    place: Sandbox
+    sandbox: Sandbox
     policy: Policy
     timeouts: Timeouts
     source: PackageSource
     runtime: Runtime
 
 
-def _wanted(sandbox: str | Sandbox, options: Options) -> _Plan:
+def _plan(sandbox: str | Sandbox, options: Options) -> _Plan:
     source = source_of(options)
     policy = policy_from(options.policy, options.limits)
     timeouts = timeouts_from(options.timeouts)
@@ -252,15 +247,15 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
 
 
-def _ahead(wanted: _Plan, options: Options) -> int | None:
+def _ahead(plan: _Plan, options: Options) -> int | None:
     """How many tasks are started ahead, unasked none where it is not ours alone to say.
 
     A container's memory is all its jails', a quota is all a key's, and a GPU everybody's.
     """
-    asked = wanted.policy.prewarm
-    if asked is None and (options.sandbox != "process" or wanted.policy.gpu):
+    prewarm = plan.policy.prewarm
+    if prewarm is None and (options.sandbox != "process" or plan.policy.gpu):
         return 0
-    return asked
+    return prewarm
 
 
 # --- what arguments mean
@@ -321,8 +316,8 @@ def _extra(module: str, name: str) -> Any:
     """What makes a place that is no part of the core, which therefore imports it by its name.
     Raises ``SandboxUnavailableError``: this installation lacks it.
     """
-    module, what = f"envhub_sandbox.extras.{module}", option_name("sandbox")
-    return extras.required(module, name, what, f"use {option_name('sandbox', 'process')}")
+    instead = f"use {option_name('sandbox', 'process')}"
+    return extras.required(f"envhub_sandbox.extras.{module}", name, option_name("sandbox"), instead)
 
 
 def _unknown(sandbox: object) -> PolicyError:
@@ -337,8 +332,8 @@ def interpreter(python: str | Path | None) -> str:
     if python is None:
         return ""
     text = os.path.expanduser(python)
-    found = shutil.which(text) if os.sep not in str(text) else None
-    return os.path.abspath(found or text)
+    program = shutil.which(text) if os.sep not in str(text) else None
+    return os.path.abspath(program or text)
 
 
 def check_executable(python: str) -> None:

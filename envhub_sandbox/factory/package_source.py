@@ -36,11 +36,11 @@ class PackageSource:
     def packages(self, snapshot: Snapshot, target: Any, *, gpu: bool) -> Any:
         """Packages of the repository's own, made for a place; None for those of the place."""
 
-    def advice(self, snapshot: Snapshot, place: str, *, own: bool, said: str) -> str:
+    def advice(self, snapshot: Snapshot, place: str, own: bool, text: str) -> str:
         """What to do where a module is missing, for the error's text."""
         return "Install it into the interpreter that runs the environment"
 
-    def note(self, snapshot: Snapshot, target: Any, said: str) -> bool:
+    def note(self, snapshot: Snapshot, target: Any, text: str) -> bool:
         """Note a module that was missing; whether ``packages`` gives others now."""
         return False
 

@@ -114,8 +114,8 @@ def make_vector(
 def _with_render_mode(options: dict[str, Any], render_mode: str | None) -> dict[str, Any]:
     if render_mode is None:
         return options
-    given = {**(options.get("env_kwargs") or {}), "render_mode": render_mode}
-    return {**options, "env_kwargs": given}
+    env_kwargs = {**(options.get("env_kwargs") or {}), "render_mode": render_mode}
+    return {**options, "env_kwargs": env_kwargs}
 
 
 if ENV_ID not in gymnasium.registry:

@@ -35,11 +35,13 @@ def main() -> None:
 
 def split_eval_arguments(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
     """Our options by name, and the others."""
-    ours = [one for one in arguments if one.startswith(_PREFIX)]
-    options = {}
-    for one in ours:
-        name, equals, text = one.removeprefix(_PREFIX).partition("=")
+    options, others = {}, []
+    for argument in arguments:
+        if not argument.startswith(_PREFIX):
+            others.append(argument)
+            continue
+        name, equals, text = argument.removeprefix(_PREFIX).partition("=")
         if not equals:
-            sys.exit(f"lerobot-eval-sandboxed: {one} takes a value: {one}=...")
+            sys.exit(f"lerobot-eval-sandboxed: {argument} takes a value: {argument}=...")
         options[name.replace("-", "_")] = json_or_text(text)
-    return options, [one for one in arguments if one not in ours]
+    return options, others

@@ -47,8 +47,8 @@ def envhub_env(request: pytest.FixtureRequest) -> Iterator[Any]:
     for mark in reversed(list(marks)):  # the nearest last, which wins
         options |= mark.kwargs
     chosen = options.pop("suite", None), options.pop("task", None)
-    with make_env(_from_where_pytest_began(ref, request), **options) as made:
-        yield choose(made, *chosen)
+    with make_env(_from_where_pytest_began(ref, request), **options) as suites:
+        yield choose(suites, *chosen)
 
 
 def _from_where_pytest_began(ref: str, request: pytest.FixtureRequest) -> str:

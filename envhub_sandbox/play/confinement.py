@@ -52,13 +52,15 @@ class Confinement:
         """Of what ran. Trust: a server on another host may have said which layers hold."""
         ran = provenance or {}
         layers = ran.get("layers") or ()
-        missing = [one for one in layers if one.get("enforced") is not True][:_MOST]
+        lacks = [layer for layer in layers if layer.get("enforced") is not True][:_MOST]
         return cls(
             asked=asked,
             profile=ran.get("profile") or "",
-            missing=tuple((_line(one.get("layer")), _line(one.get("detail"))) for one in missing),
+            missing=tuple(
+                (_line(layer.get("layer")), _line(layer.get("detail"))) for layer in lacks
+            ),
             unrecorded=_line(unrecorded),
-            held=sum(one.get("enforced") is True for one in layers),
+            held=sum(layer.get("enforced") is True for layer in layers),
         )
 
     @property
@@ -102,15 +104,15 @@ def _line(text: object) -> str:
 def denial_findings(denied: Iterable[str]) -> dict[str, list[str]]:
     """The findings of each check, of what was denied. Trust: paths are a stranger's words."""
     checks = ("denied-network", "denied-files", "denied-kernel", "limits-reached")
-    found: dict[str, list[str]] = {check: [] for check in checks}
-    for one in sorted(set(denied) - _HARMLESS):
-        check, text = _finding(one)
-        found[check].append(text)
-    return found
+    findings: dict[str, list[str]] = {check: [] for check in checks}
+    for denial in sorted(set(denied) - _HARMLESS):
+        check, text = _finding(denial)
+        findings[check].append(text)
+    return findings
 
 
-def _finding(one: str) -> tuple[str, str]:
-    deed, _, path = one.partition(" ")
+def _finding(denial: str) -> tuple[str, str]:
+    deed, _, path = denial.partition(" ")
     if path.startswith("/"):
         return (
             "denied-files",
@@ -118,7 +120,7 @@ def _finding(one: str) -> tuple[str, str]:
         )
     if deed == "limit":
         return "limits-reached", f"reached the limit of {path.lower()}"
-    if one.endswith(_OTHER):
+    if denial.endswith(_OTHER):
         return "denied-kernel", f"tried {deed} on another process"
-    is_network = one.startswith(_NETWORK) and one not in _LOCAL
-    return "denied-network" if is_network else "denied-kernel", f"tried {one}, which was denied"
+    is_network = denial.startswith(_NETWORK) and denial not in _LOCAL
+    return "denied-network" if is_network else "denied-kernel", f"tried {denial}, which was denied"

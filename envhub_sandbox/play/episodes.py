@@ -195,9 +195,9 @@ def success_of(infos: Any, index: int) -> bool | None:
     if not isinstance(infos, Mapping):
         return None
     for source in (infos.get("final_info"), infos):
-        found = _success_in(source, index)
-        if isinstance(found, (bool, int, float, np.bool_, np.number)):
-            return bool(found)
+        success = _success_in(source, index)
+        if isinstance(success, (bool, int, float, np.bool_, np.number)):
+            return bool(success)
     return None
 
 
@@ -278,33 +278,28 @@ def zero_action(space: gym.Space[Any]) -> Any:
     """A member of ``space`` that is zero, or as near to it as the space allows.
     Raises ``gymnasium.error.CustomSpaceError``: the space is none of Gymnasium's.
     """
-    for kind, zero in _ZEROS.items():
-        if isinstance(space, kind):
-            return zero(space)
+    match space:
+        case spaces.Box():
+            return np.array(np.clip(np.zeros(space.shape), space.low, space.high), space.dtype)
+        case spaces.Discrete():
+            start = int(space.start)
+            return space.dtype.type(min(max(0, start), start + int(space.n) - 1))
+        case spaces.MultiDiscrete():
+            return np.clip(0, space.start, space.start + space.nvec - 1).astype(space.dtype)
+        case spaces.MultiBinary():
+            return np.zeros(space.shape, space.dtype)
+        case spaces.Text():
+            return space.character_list[0] * space.min_length if space.min_length else ""
+        case spaces.Dict():
+            return {key: zero_action(member) for key, member in space.spaces.items()}
+        case spaces.Tuple():
+            return tuple(map(zero_action, space.spaces))
+        case spaces.Sequence():
+            empty = gym.vector.utils.create_empty_array
+            return empty(space.feature_space, 0) if space.stack else ()
+        case spaces.Graph():
+            nodes = np.array([zero_action(space.node_space)])
+            return spaces.GraphInstance(nodes=nodes, edges=None, edge_links=None)
+        case spaces.OneOf():
+            return 0, zero_action(space.spaces[0])
     raise CustomSpaceError(f"no zero action is known for {type(space).__name__}")
-
-
-_ZEROS: dict[Any, Any] = {
-    spaces.Box: lambda space: np.array(
-        np.clip(np.zeros(space.shape), space.low, space.high), space.dtype
-    ),
-    spaces.Discrete: lambda space: space.dtype.type(
-        min(max(0, int(space.start)), int(space.start) + int(space.n) - 1)
-    ),
-    spaces.MultiDiscrete: lambda space: np.clip(
-        0, space.start, space.start + space.nvec - 1
-    ).astype(space.dtype),
-    spaces.MultiBinary: lambda space: np.zeros(space.shape, space.dtype),
-    spaces.Text: lambda space: (
-        space.character_list[0] * space.min_length if space.min_length else ""
-    ),
-    spaces.Dict: lambda space: {key: zero_action(one) for key, one in space.spaces.items()},
-    spaces.Tuple: lambda space: tuple(map(zero_action, space.spaces)),
-    spaces.Sequence: lambda space: (
-        gym.vector.utils.create_empty_array(space.feature_space, 0) if space.stack else ()
-    ),
-    spaces.Graph: lambda space: spaces.GraphInstance(
-        nodes=np.array([zero_action(space.node_space)]), edges=None, edge_links=None
-    ),
-    spaces.OneOf: lambda space: (0, zero_action(space.spaces[0])),
-}

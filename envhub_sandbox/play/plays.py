@@ -139,10 +139,10 @@ def video_writer(path: Path, fps: float) -> Iterator[Callable[[Frame], None]]:
 
     def add(frame: Frame) -> None:
         nonlocal encoder, size, count
-        given = (frame.shape[1], frame.shape[0])
+        frame_size = (frame.shape[1], frame.shape[0])
         try:
             if encoder is None:
-                size = given
+                size = frame_size
                 # absolute, so that ffmpeg can take no name for an option or a protocol
                 encoder = imageio_ffmpeg.write_frames(
                     os.path.abspath(path),
@@ -154,8 +154,8 @@ def video_writer(path: Path, fps: float) -> Iterator[Callable[[Frame], None]]:
                 encoder.send(None)
         except (OSError, RuntimeError) as error:
             raise VideoError(f"ffmpeg does not start: {error}") from error
-        if given != size:
-            raise VideoError(f"the size of frames changed from {size} to {given} pixels")
+        if frame_size != size:
+            raise VideoError(f"the size of frames changed from {size} to {frame_size} pixels")
         try:
             encoder.send(np.ascontiguousarray(frame))
         except OSError as error:
@@ -224,14 +224,14 @@ class Play:
 def facts_of(env: VectorEnv[Any, Any, Any]) -> dict[str, str]:
     """What an environment says of itself, printable and bounded."""
     mode = (env.metadata or {}).get("autoreset_mode")
-    found = {
+    facts = {
         "observations": env.single_observation_space,
         "actions": env.single_action_space,
         "sub-environments": env.num_envs,
         "autoreset": getattr(mode, "name", None) or "it does not say",
         "render mode": env.render_mode or "none",
     }
-    return {name: printable(str(value), 1_000) for name, value in found.items()}
+    return {name: printable(str(value), 1_000) for name, value in facts.items()}
 
 
 def film(env: VectorEnv[Any, Any, Any], *, seed: int, seconds: float = _SECONDS) -> Film:

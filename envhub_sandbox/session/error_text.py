@@ -174,11 +174,11 @@ def _advice(text: str, policy: Policy) -> str:
 
 def _to_install(text: str) -> list[str]:
     """The packages of a command that a text quotes."""
-    found = re.search(_COMMAND, text.replace("', '", " "))
-    if found is None:
+    command = re.search(_COMMAND, text.replace("', '", " "))
+    if command is None:
         return ["PACKAGE"]
-    quoted_whole = found["quote"] and found["more"]
-    return [found["first"], *(re.findall(_REQUIREMENT, found["more"]) if quoted_whole else [])]
+    is_quoted = command["quote"] and command["more"]
+    return [command["first"], *(re.findall(_REQUIREMENT, command["more"]) if is_quoted else [])]
 
 
 def _of_display(text: str, policy: Policy) -> str:

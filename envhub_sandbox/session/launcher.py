@@ -420,12 +420,12 @@ class Launcher:
         try:
             status = self._ask(server, m.GetStatus(), Deadline(timeout_s))
             with UNTRUSTED:
-                jails = [
-                    one for one in expect_reply(status, m.Status).jails if isinstance(one, dict)
-                ]
-                return next((status for status in jails if status.get("jail") == jail), {})
+                for facts in expect_reply(status, m.Status).jails:
+                    if isinstance(facts, dict) and facts.get("jail") == jail:
+                        return facts
         except EnvHubError:  # it is for a text, or a figure that may be missing
-            return {}
+            pass
+        return {}
 
     def denials(self, server: WorkerServer, jail: int) -> tuple[str, ...] | None:
         """What a jail was denied; None where it is not recorded, or not known any more."""

@@ -177,16 +177,16 @@ def _spec(value: object) -> Any:
     return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if spec is None else spec
 
 
-def spec_of(given: dict[str, Any] | None) -> EnvSpec | None:
+def spec_of(description: dict[str, Any] | None) -> EnvSpec | None:
     """A spec with these facts, as ``read_spec`` lets them through.
 
     A string names what refuses, so that it can be written as JSON like any other.
-    ``given``: ``id``, ``max_episode_steps``, ``reward_threshold``, ``nondeterministic``.
+    ``description``: ``id``, ``max_episode_steps``, ``reward_threshold``, ``nondeterministic``.
     """
     # gym.make imports what stands before a colon
-    if given is None or given.get("id") is None or ":" in given["id"]:
+    if not description or description.get("id") is None or ":" in description["id"]:
         return None
-    facts = {name: value for name, value in given.items() if value is not None}
+    facts = {name: value for name, value in description.items() if value is not None}
     try:
         return EnvSpec(**facts, entry_point=_REFUSAL, vector_entry_point=_REFUSAL)
     except Exception:  # an id that this Gymnasium cannot read: not worth failing for

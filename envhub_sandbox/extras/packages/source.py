@@ -64,13 +64,13 @@ class RepositoryPackages:
             return locked_packages(snapshot, self.lock)
         return None if target is None else packages_for(snapshot, self.choice, target, gpu=gpu)
 
-    def advice(self, snapshot: Snapshot, place: str, *, own: bool, said: str) -> str:
+    def advice(self, snapshot: Snapshot, place: str, own: bool, text: str) -> str:
         """What to do where a module is missing, for the error's text."""
-        return MissingModule(snapshot, place, self.choice.where, self.python, own).advice(said)
+        return MissingModule(snapshot, place, self.choice.where, self.python, own).advice(text)
 
-    def note(self, snapshot: Snapshot, target: PackageTarget | None, said: str) -> bool:
+    def note(self, snapshot: Snapshot, target: PackageTarget | None, text: str) -> bool:
         """Note a module that was missing; whether ``packages`` gives others now."""
-        return self.choice.infer and self._chooses(target) and note_missing(snapshot, said)
+        return self.choice.infer and self._chooses(target) and note_missing(snapshot, text)
 
     def _chooses(self, target: PackageTarget | None) -> bool:
         """Whether the versions of its packages are ours to choose."""

@@ -41,7 +41,7 @@ ASKS_CONFIGS = hasattr(EnvConfig, "create_envs")
 
 _SAID_OTHERWISE = {"n_envs", "use_async_envs", "trust_remote_code", "token"}
 _OPTIONS = {
-    key: one for key, one in OPTIONS.items() if not one.field and key not in _SAID_OTHERWISE
+    key: OPTIONS[key] for key in OPTIONS if not OPTIONS[key].field and key not in _SAID_OTHERWISE
 }
 
 
@@ -89,16 +89,17 @@ _NO_REPO = "env.repo is missing: which repository? --env.repo=org/repo@<commit>"
 
 def _with_options(config: type[Any]) -> type[Any]:
     """A field for each option, of the type that it has on a command line."""
-    for key, one in _OPTIONS.items():
-        if one.kind is dict:
+    for key, option in _OPTIONS.items():
+        if option.kind is dict:
             config.__annotations__[key] = dict[str, Any]
             setattr(config, key, field(default_factory=dict))
-        elif one.kind is list:
+        elif option.kind is list:
             config.__annotations__[key] = list[str]
             setattr(config, key, field(default_factory=list))
         else:
-            config.__annotations__[key] = one.kind if one.default is not None else one.kind | None
-            setattr(config, key, one.default)
+            optional = option.default is None
+            config.__annotations__[key] = option.kind | None if optional else option.kind
+            setattr(config, key, option.default)
     return config
 
 
@@ -194,16 +195,16 @@ class SandboxedEnvConfig(EnvConfig):
 
     def _options(self) -> dict[str, Any]:
         """``make_env``'s, as the fields say them."""
-        said = {key: getattr(self, key) for key in _OPTIONS}
-        said |= {key: said[key] or None for key, one in _OPTIONS.items() if one.kind is dict}
-        if isinstance(said["dependencies"], str) and said["dependencies"].startswith("{"):
-            said["dependencies"] = json.loads(said["dependencies"])
-        return said
+        values = {key: getattr(self, key) for key in _OPTIONS}
+        values |= {key: values[key] or None for key in _OPTIONS if _OPTIONS[key].kind is dict}
+        if isinstance(values["dependencies"], str) and values["dependencies"].startswith("{"):
+            values["dependencies"] = json.loads(values["dependencies"])
+        return values
 
     def _made(self, n_envs: int, use_async_envs: bool) -> EnvSuites:
-        asked = {"n_envs": n_envs, "use_async_envs": use_async_envs, **self._options()}
+        options = {"n_envs": n_envs, "use_async_envs": use_async_envs, **self._options()}
         with use_option_names(on_lerobots_command_line()):
-            suites = for_lerobot(make_env(self.repo, **asked))
+            suites = for_lerobot(make_env(self.repo, **options))
         with closed_if_it_fails(suites):
             keep_only(suites, self.suite, self.task)
         return suites
@@ -244,13 +245,13 @@ class SandboxedEnvConfig(EnvConfig):
                     f"env.features has {key!r}, and env.features_map does not say what a policy "
                     f'calls it: --env.features_map=\'{{"{key}": "observation.NAME"}}\''
                 )
-            known = printable(", ".join(self.features), _LONGEST)
-            raise ValueError(f"env.features_map names {key!r}; {self.repo} has {known}")
+            names_there = printable(", ".join(self.features), _LONGEST)
+            raise ValueError(f"env.features_map names {key!r}; {self.repo} has {names_there}")
 
     def _key(self, n_envs: int, use_async_envs: bool) -> str:
         own = [item.name for item in fields(SandboxedEnvConfig)]
-        asked = {name: getattr(self, name) for name in own if not name.startswith("features")}
-        return repr((n_envs, bool(use_async_envs), asked))
+        values = {name: getattr(self, name) for name in own if not name.startswith("features")}
+        return repr((n_envs, bool(use_async_envs), values))
 
 
 def _on_lerobots_command_line() -> bool:
@@ -266,7 +267,7 @@ def _expected() -> tuple[int, bool]:
     """
     if parser.parse_arg("env.repo") is None:
         return 1, False
-    said = {item.name: parser.parse_arg(f"eval.{item.name}") for item in fields(EvalConfig)}
-    arguments = [f"--{name}={text}" for name, text in said.items() if text is not None]
+    texts = {item.name: parser.parse_arg(f"eval.{item.name}") for item in fields(EvalConfig)}
+    arguments = [f"--{name}={text}" for name, text in texts.items() if text is not None]
     chosen = draccus.parse(config_class=EvalConfig, args=arguments)
     return chosen.batch_size, chosen.use_async_envs

@@ -58,8 +58,9 @@ class Step:
 
 def processors(steps: list[Step]) -> Any:
     """LeRobot's pipeline of these."""
-    made = [ProcessorStepRegistry.get(step.name)(**step.config) for step in steps]
-    return PolicyProcessorPipeline(steps=made)
+    return PolicyProcessorPipeline(
+        steps=[ProcessorStepRegistry.get(step.name)(**step.config) for step in steps]
+    )
 
 
 def steps_for(
@@ -90,9 +91,9 @@ def steps_for(
     return [Step(ARENA, {name: tuple(chosen.get(name, own)) for name, own in there.items()})]
 
 
-def _declared(said: object) -> Iterator[Step]:
+def _declared(declared: object) -> Iterator[Step]:
     """Plain data in the form of LeRobot's own files: nothing is imported by a name in it."""
-    steps = said.get("steps") if isinstance(said, dict) else said
+    steps = declared.get("steps") if isinstance(declared, dict) else declared
     for step in steps if isinstance(steps, (list, tuple)) else [steps]:
         name = step.get("registry_name") if isinstance(step, dict) else None
         config = step.get("config") or {} if isinstance(step, dict) else {}
@@ -213,5 +214,5 @@ def _split(text: str) -> list[str]:
 
 def as_features(seen: Mapping[str, Feature]) -> tuple[dict[str, Any], dict[str, str]]:
     """``features`` and ``features_map`` of an ``EnvConfig``."""
-    features = {key: PolicyFeature(type=it.kind, shape=it.shape) for key, it in seen.items()}
-    return features, {key: it.policy_key for key, it in seen.items()}
+    features = {key: PolicyFeature(type=item.kind, shape=item.shape) for key, item in seen.items()}
+    return features, {key: item.policy_key for key, item in seen.items()}

@@ -33,10 +33,10 @@ def install(**options: Any) -> None:
     Raises ``TypeError``: an option that it does not have; ``RuntimeError``: this LeRobot loads
     repositories in another way than is known here.
     """
-    known = [key for key, one in OPTIONS.items() if not one.field and key not in _GIVEN]
-    unknown = [name for name in options if name not in known]
+    names = [key for key in OPTIONS if not OPTIONS[key].field and key not in _GIVEN]
+    unknown = [name for name in options if name not in names]
     if unknown:
-        raise TypeError(f"there is no option {', '.join(unknown)}; there are {', '.join(known)}")
+        raise TypeError(f"there is no option {', '.join(unknown)}; there are {', '.join(names)}")
     if options.get("sandbox", "process") is None:
         raise TypeError("sandbox is None: LeRobot itself runs code in this process, uninstalled")
     factory = lerobot.envs.factory
