@@ -44,7 +44,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.runner.described import described
-from envhub_worker.runner.shared_state import SharedState
+from envhub_worker.runner.state.shared_state import SharedState
 from envhub_worker.runner.sync_envs import SubEnvs
 from envhub_worker.runner.tasks import Task
 

@@ -25,16 +25,17 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits, limits_for
 from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
-from envhub_worker.runner import generators, loader, manifest
 from envhub_worker.runner import gymnasium_compat as compat
-from envhub_worker.runner.copies import taken
+from envhub_worker.runner import loader, manifest
 from envhub_worker.runner.described import described, raised
 from envhub_worker.runner.independence import Budget, are_independent
 from envhub_worker.runner.lane import ColumnLane, Lane
 from envhub_worker.runner.prefixes import WarningLog, Watches
 from envhub_worker.runner.recording import standing_in
 from envhub_worker.runner.returned import misfit_in_vector
-from envhub_worker.runner.shared_state import SharedState
+from envhub_worker.runner.state import generators
+from envhub_worker.runner.state.copies import taken
+from envhub_worker.runner.state.shared_state import SharedState
 from envhub_worker.runner.sync_envs import Pairs, SubEnvs
 from envhub_worker.runner.tasks import ResultError, Task, tasks_of
 

@@ -27,10 +27,10 @@ from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 from envhub_worker.runner import returned
-from envhub_worker.runner.copies import kept, taken
 from envhub_worker.runner.foreign import old_gym
 from envhub_worker.runner.gymnasium_compat import SyncBase
-from envhub_worker.runner.shared_state import SharedState
+from envhub_worker.runner.state.copies import kept, taken
+from envhub_worker.runner.state.shared_state import SharedState
 
 _NUMBERS = (float, int, np.number, np.bool_)
 

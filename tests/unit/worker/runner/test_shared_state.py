@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from envhub_worker.protocol.messages.prefix import SHARED_STATE
-from envhub_worker.runner.shared_state import SharedState
+from envhub_worker.runner.state.shared_state import SharedState
 
 
 @pytest.fixture
