@@ -120,11 +120,11 @@ _OSMESA = rf"(?i)osmesa[^\n]{{0,80}}{_NO_LIBRARY}|{_NO_LIBRARY}[^\n]{{0,80}}osme
 _TEXT_CHARS = 65_536
 
 
-def add_reach_advice(error: EnvHubError, policy: Policy) -> None:
-    """Add what to do to an error of a download, a socket or a window, once."""
+def add_reach_advice(error: EnvHubError, policy: Policy) -> bool:
+    """Add what to do to an error of a download, a socket or a window, once; whether it is one."""
     remote = error if isinstance(error, RemoteEnvError) else error.__cause__
     if "__notes__" in vars(error):
-        return
+        return False
     advice = ""
     if isinstance(remote, RemoteEnvError):
         advice = _advice(f"{remote.type_name}: {remote.message}"[:_TEXT_CHARS], policy)
@@ -132,6 +132,7 @@ def add_reach_advice(error: EnvHubError, policy: Policy) -> None:
         advice = _of_display(error.log_tail[-_TEXT_CHARS:], policy)
     if advice and not str(error).endswith(advice):
         error.args = (f"{error.args[0]}\n{advice}", *error.args[1:])
+    return bool(advice)
 
 
 def _advice(text: str, policy: Policy) -> str:

@@ -291,8 +291,8 @@ class Repository:
             elif advice and advice not in str(error):
                 error.args = (f"{error.args[0]}\n{advice}", *error.args[1:])
             name_source(error, self.label)
-            add_reach_advice(error, self.policy)
-            if "__notes__" not in vars(error) and (dated := self._of_its_day(error)):
+            is_explained = add_reach_advice(error, self.policy) or "__notes__" in vars(error)
+            if not is_explained and (dated := self._of_its_day(error)):
                 error.args = (f"{error.args[0]}\n{dated}", *error.args[1:])
             add_author_line(error, self.snapshot)
             raise

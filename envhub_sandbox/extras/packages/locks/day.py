@@ -34,11 +34,15 @@ _OUTDATED = re.compile(
     r"cannot import name|No module named '\w+\.|"
     r"(?i:\b(?:removed|renamed|moved to|no longer|deprecated)\b)"
 )
+_FRAME_FILE = r'(?m)^[ |+-]*File "?([^"\n]+)"?, line \d+'
 _BROKEN_BY = {
-    r"removed in the NumPy 2\.0 release": "numpy<2",
-    r"module 'numpy' has no attribute '(bool|complex|float|int|object|str)'": "numpy<1.24",
+    r"removed in the NumPy 2\.0 release": ("numpy<2", "2024-06-16"),
+    r"module 'numpy' has no attribute '(bool|complex|float|int|object|str)'": (
+        "numpy<1.24",
+        "2022-12-18",
+    ),
 }
-"""What a date may not cure, since the release was there already: by what is said then."""
+"""By what is said then: what takes an earlier release, and the day from which on no date does."""
 _RECENT = timedelta(days=30)
 _MOST_DATES, _MOST_TEXT = 4, 65_536
 
@@ -47,12 +51,11 @@ def of_its_day(snapshot: Snapshot, error: EnvHubError) -> str:
     """What to do about an error at a start that packages of the repository's day may cure; empty
     for others, and for what is of today.
     """
-    said = _said_at_start(error)
-    for pattern, requirement in _BROKEN_BY.items():
-        if re.search(pattern, said):
+    said, days = _said_at_start(error), days_for(snapshot, error)
+    for pattern, (requirement, broken) in _BROKEN_BY.items():
+        if re.search(pattern, said) and (not days or days[0] >= broken):
             older = option_name("dependencies", {"override": [requirement]})
             return f"A later release of a package has broken it; {older} takes an earlier one"
-    days = days_for(snapshot, error)
     if not days:
         return ""
     old = option_name("dependencies", {"exclude_newer": days[0]})
@@ -92,7 +95,7 @@ def days_for(snapshot: Snapshot, error: EnvHubError) -> list[str]:
     """The day on which it was written, and a few later ones, each nearer to today by half: those
     whose packages may cure an error.
     """
-    day = written(snapshot) if _OUTDATED.search(_said_at_start(error)) else ""
+    day = written(snapshot) if _may_be_outdated(error) else ""
     now = datetime.now(timezone.utc)
     then = datetime.fromisoformat(day or now.date().isoformat()).replace(tzinfo=timezone.utc)
     found: list[str] = []
@@ -102,15 +105,30 @@ def days_for(snapshot: Snapshot, error: EnvHubError) -> list[str]:
     return found
 
 
+def _may_be_outdated(error: EnvHubError) -> bool:
+    """Whether older packages may cure it: it says so, or a package raised it, and lacks no file."""
+    said = _said_at_start(error)
+    remote = _remote(error)
+    if not said or remote is None or isinstance(remote, (OSError, EOFError, MemoryError)):
+        return False
+    raised_in = re.findall(_FRAME_FILE, remote.traceback)[-1:]
+    return bool(_OUTDATED.search(said)) or any("/packages/" in file for file in raised_in)
+
+
 def _said_at_start(error: EnvHubError) -> str:
     """What code raised as it was loaded or reset; empty for any other error.
     Trust: text from the worker, by which one of our sentences is chosen.
     """
-    remote = error if isinstance(error, RemoteEnvError) else error.__cause__
-    if not isinstance(remote, RemoteEnvError):
+    remote = _remote(error)
+    if remote is None:
         return ""
     starts = isinstance(error, (LoadError, DependencyError)) or ", in reset" in remote.traceback
     return f"{remote.type_name}: {remote.message}"[:_MOST_TEXT] if starts else ""
+
+
+def _remote(error: EnvHubError) -> RemoteEnvError | None:
+    remote = error if isinstance(error, RemoteEnvError) else error.__cause__
+    return remote if isinstance(remote, RemoteEnvError) else None
 
 
 def _of_files(snapshot: Snapshot) -> str:
