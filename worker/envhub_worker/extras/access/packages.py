@@ -17,9 +17,10 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections import OrderedDict, deque
+from collections import OrderedDict, defaultdict, deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -56,62 +57,44 @@ _STOP_S = 30.0
 _RESULT_BYTES = 1 << 20
 _CHECK_S = 60.0
 
-Place = tuple[str, str]
-"""Whose an order is, and its hash."""
-
-
-@dataclass
-class Order:
-    """An order that a client waits for: when it was asked for last, what the program said last."""
-
-    plain: dict[str, Any]
-    owner: bytes = b""
-    asked: float = field(default_factory=monotonic)
-    progress: str = "at work"
-
-
-Outcome = tuple[Mapping[str, Any], float]
-"""What became of an order: the program's own words, and when."""
+OrderId = tuple[str, str]
+"""The name of the client's folder, and the hash of what it asks for."""
 News = tuple[bytes, float, Mapping[str, Any]]
-"""For the log: whose session ordered first, how long the program took, its last words."""
+"""For the log: whose session ordered first, how long the program took, its result."""
 
 
 class PackageProgram:
     """The program, at work on one order.
-
-    Attributes:
-        place: Whose the order is, and its hash.
-        ended_at: When it was asked to end; None before.
+    ``ended_at``: when it was asked to end; None before.
     """
 
-    def __init__(self, place: Place, order: Mapping[str, Any]) -> None:
-        self.place = place
+    def __init__(self, request: Mapping[str, Any]) -> None:
         self.since = monotonic()
         self.ended_at: float | None = None
         with contextlib.ExitStack() as undo:
-            self._said = undo.enter_context(tempfile.TemporaryFile())
-            with tempfile.TemporaryFile() as given:
-                given.write(json.dumps(order).encode())
-                given.seek(0)
+            self._output = undo.enter_context(tempfile.TemporaryFile())
+            with tempfile.TemporaryFile() as stdin:
+                stdin.write(json.dumps(request).encode())
+                stdin.seek(0)
                 ourselves = os.pidfd_open(os.getpid())  # it ends when we do, whatever ends us
                 try:
                     self._process = subprocess.Popen(
                         [*command(), f"--server-pidfd={ourselves}"],
-                        stdin=given,
-                        stdout=self._said,
+                        stdin=stdin,
+                        stdout=self._output,
                         cwd="/",
                         start_new_session=True,
                         pass_fds=(ourselves,),
                     )
                 finally:
                     os.close(ourselves)
-            undo.pop_all()  # it lasts as long as the program
+            undo.pop_all()  # the output lasts as long as the program
 
-    def said(self) -> Mapping[str, Any]:
-        """What the program has said; nothing while it writes."""
+    def output(self) -> Mapping[str, Any]:
+        """What the program has written last; nothing while it writes."""
         try:
-            found = json.loads(os.pread(self._said.fileno(), _RESULT_BYTES, 0))
-            return found if isinstance(found, dict) else {}
+            document = json.loads(os.pread(self._output.fileno(), _RESULT_BYTES, 0))
+            return document if isinstance(document, dict) else {}
         except ValueError:
             return {}
 
@@ -134,8 +117,26 @@ class PackageProgram:
         self._process.wait()
 
     def close(self) -> None:
-        """It has ended: forget what it said."""
-        self._said.close()
+        """It has ended: forget its output."""
+        self._output.close()
+
+
+@dataclass
+class Order:
+    """An order, from the first request for it until it is forgotten.
+
+    Attributes:
+        asked: When a client asked for it last.
+        program: While it is made; an order with neither this nor a result waits.
+        result: The last words of the program, and when they came.
+    """
+
+    plain: dict[str, Any]
+    owner: bytes
+    asked: float = field(default_factory=monotonic)
+    progress: str = "at work"
+    program: PackageProgram | None = None
+    result: tuple[Mapping[str, Any], float] | None = None
 
 
 def command() -> list[str]:
@@ -153,10 +154,10 @@ def why_impossible() -> str:
         return f"the program that makes packages did not answer in {_CHECK_S:.0f} s"
     if done.returncode == 0:
         return ""
-    said = done.stderr.decode(errors="replace").strip().splitlines() or ["no word"]
+    lines = done.stderr.decode(errors="replace").strip().splitlines() or ["no word"]
     return (
         "packages are installed by envhub-sandbox, which does not work in this worker's "
-        f"interpreter ({sys.executable}): {said[-1][:500]}. Run: {sys.executable} -m pip install "
+        f"interpreter ({sys.executable}): {lines[-1][:500]}. Run: {sys.executable} -m pip install "
         "envhub-sandbox"
     )
 
@@ -169,15 +170,13 @@ class Packages:
     def __init__(
         self, folder: Path | None, quotas: Quotas, make_s: float = MAKE_S, *, shared: bool = False
     ) -> None:
-        self._folder = folder
-        self._shared = shared
-        self._quotas = quotas
-        self._make_s = make_s
-        self._line: OrderedDict[Place, Order] = OrderedDict()
-        self._outcomes: OrderedDict[Place, Outcome] = OrderedDict()
-        self._handed: dict[Place, tuple[Runtime, float]] = {}
-        self._begun: dict[str, deque[float]] = {}
-        self._at_work: dict[str, PackageProgram] = {}  # by key
+        self._folder, self._quotas = folder, quotas
+        self._make_s, self._shared = make_s, shared
+        self._orders: OrderedDict[OrderId, Order] = OrderedDict()
+        self._handed: dict[OrderId, tuple[Runtime, float]] = {}
+        self._begun: defaultdict[str, deque[float]] = defaultdict(
+            partial(deque, maxlen=MAX_PER_HOUR)
+        )
         self._news: list[News] = []
         if folder is not None:
             make_passable(folder)
@@ -191,35 +190,40 @@ class Packages:
         Raises ``RefusedError``: they cannot be made, or not now.
         """
         if self._folder is None:
-            return _not_here(request)
+            if not request.always:
+                return m.Packages(
+                    "own", "", {}, "this server makes no environments (--dependencies)"
+                )
+            raise RefusedError(
+                "PolicyError",
+                "dependencies: this server installs no packages; start it with --dependencies, or "
+                "in an interpreter that has them",
+            )
         plain = checked(request)
         home = self._home(key)
-        place = home, hashlib.sha256(json.dumps(plain).encode()).hexdigest()
+        order_id = home, hashlib.sha256(json.dumps(plain).encode()).hexdigest()
         self.look(in_use)
-        found = self._outcomes.get(place)
-        if found is not None:
-            reply = self._answer(place, found)
-            if reply is not None:
-                return reply
-        order = self._line.get(place)
-        if order is None:
-            order = self._take(place, plain)
-            order.owner = owner
+        reply = self._reply(order_id)
+        if reply is None and order_id not in self._orders:
+            self._check_room(home)
+            self._orders[order_id] = Order(plain, owner)
             self.look(in_use)
-            if place in self._outcomes:
-                return self.need(key, request, in_use, owner)
+            reply = self._reply(order_id)
+        if reply is not None:
+            return reply
+        order = self._orders[order_id]
         order.asked = monotonic()
-        progress = order.progress if self._is_at(place) else self._waits(place)
+        progress = order.progress if order.program is not None else self._why_waiting(order_id)
         return m.Packages("making", "", {}, progress)
 
     def runtime(self, key: bytes, name: str) -> Runtime:
-        """What a client's packages are, and their interpreter. Raises ``RefusedError``."""
-        found = self._handed.get((self._home(key), name))
-        if found is None or not os.path.isdir(found[0].packages):
+        """A client's packages, and their interpreter. Raises ``RefusedError``."""
+        runtime, _ = self._handed.get((self._home(key), name), (None, 0.0))
+        if runtime is None or not os.path.isdir(runtime.packages):
             raise RefusedError(
                 "WorkerError", "this server has no such packages; ask for them first"
             )
-        return found[0]
+        return runtime
 
     def _home(self, key: bytes) -> str:
         return SHARED if self._shared else key.hex()[:32] or "local"
@@ -227,18 +231,15 @@ class Packages:
     def look(self, in_use: Collection[str]) -> None:
         """Take what is done, give up what is not asked for, and begin the next."""
         now = monotonic()
-        for work in list(self._at_work.values()):
-            self._follow(work, now)
-        deserted = [
-            place
-            for place, order in self._line.items()
-            if now - order.asked > _FORGOTTEN_S and not self._is_at(place)
-        ]
-        for place in deserted:
-            del self._line[place]
-        for place in self._next():
-            if len(self._at_work) < MAX_AT_WORK and place[0] not in self._at_work:
-                self._begin(place, in_use)
+        for order_id, order in list(self._orders.items()):
+            if order.program is not None:
+                self._follow(order_id, order, order.program, now)
+            elif order.result is None and now - order.asked > _FORGOTTEN_S:
+                del self._orders[order_id]
+        for order_id in self._waiting():
+            running = self._running()
+            if len(running) < MAX_AT_WORK and order_id[0] not in running:
+                self._begin(order_id, in_use)
 
     def news(self) -> list[News]:
         """What became of orders since this was asked last."""
@@ -247,121 +248,128 @@ class Packages:
 
     def close(self) -> None:
         """End the programs; they leave nothing half-made, or the next ones remove it."""
-        works, self._at_work = list(self._at_work.values()), {}
+        programs = list(self._running().values())
+        self._orders.clear()
         now = monotonic()
-        for work in works:
-            work.terminate(now)
+        for program in programs:
+            program.terminate(now)
         until = now + _STOP_S
-        for work in works:
-            work.kill(max(0.0, until - monotonic()))
+        for program in programs:
+            program.kill(max(0.0, until - monotonic()))
 
     # --- orders --------------------------------------------------------------------------------
 
-    def _answer(self, place: Place, found: Outcome) -> m.Packages | None:
-        said, when = found
-        if "own" in said:
+    def _reply(self, order_id: OrderId) -> m.Packages | None:
+        """The answer to an order that has a result; None where it has none, or none any more."""
+        order = self._orders.get(order_id)
+        if order is None or order.result is None:
+            return None
+        result, when = order.result
+        if "own" in result:
             return m.Packages("own", "", {}, "this server's interpreter has all of it")
-        made = said.get("made")
-        if made is not None and os.path.isdir(made["packages"]):
-            home, name = place[0], made["name"]
-            self._handed[home, name] = Runtime(made["python"], made["packages"]), monotonic()
+        environment = result.get("made")
+        if environment is not None and os.path.isdir(environment["packages"]):
+            name, folder = environment["name"], environment["packages"]
+            self._handed[order_id[0], name] = Runtime(environment["python"], folder), monotonic()
             with contextlib.suppress(OSError):
-                os.utime(Path(made["packages"]).with_name("environment.json"))
-            return m.Packages("made", name, made["facts"], "")
-        if made is None and monotonic() - when < _FAILED_S:
-            raise RefusedError("DependencyError", str(said["said"]), missing=str(said["error"]))
-        del self._outcomes[place]
+                os.utime(Path(folder).with_name("environment.json"))
+            return m.Packages("made", name, environment["facts"], "")
+        if environment is None and monotonic() - when < _FAILED_S:
+            raise RefusedError("DependencyError", str(result["said"]), missing=str(result["error"]))
+        del self._orders[order_id]
         return None
 
-    def _take(self, place: Place, plain: dict[str, Any]) -> Order:
-        mine = sum(1 for home, _ in self._line if home == place[0])
-        hour = self._begun.setdefault(place[0], deque(maxlen=MAX_PER_HOUR))
+    def _check_room(self, home: str) -> None:
+        unfinished = [names for (names, _), order in self._orders.items() if order.result is None]
+        hour = self._begun[home]
         while hour and monotonic() - hour[0] > _HOUR_S:
             hour.popleft()
         yours = "orders of your key for packages"
-        for used, limit, what in (
-            (mine, MAX_WAITING, f"{yours} wait already"),
+        for used, limit, text in (
+            (unfinished.count(home), MAX_WAITING, f"{yours} wait already"),
             (len(hour), MAX_PER_HOUR, f"{yours} were begun in the last hour"),
-            (len(self._line), MAX_IN_LINE, "orders for packages wait already"),
+            (len(unfinished), MAX_IN_LINE, "orders for packages wait already"),
         ):
             if used >= limit:
                 busy = Busy("packages", used, limit, _RETRY_S)
-                raise BusyError(busy, f"packages: {used} {what}, and the server takes {limit}")
-        self._line[place] = order = Order(plain)
-        return order
+                raise BusyError(busy, f"packages: {used} {text}, and the server takes {limit}")
 
     # --- the program ---------------------------------------------------------------------------
 
-    def _next(self) -> list[Place]:
+    def _running(self) -> dict[str, PackageProgram]:
+        """The programs at work, by the folder of their key: each key has one at most."""
+        orders = self._orders.items()
+        return {home: order.program for (home, _), order in orders if order.program is not None}
+
+    def _waiting(self) -> list[OrderId]:
         """Who waits, in turn: first the key for which nothing was begun for longest."""
-        waiting = [place for place in self._line if not self._is_at(place)]
-        return sorted(waiting, key=lambda place: (self._begun.get(place[0]) or [0.0])[-1])
+        orders = self._orders.items()
+        waiting = [name for name, order in orders if order.program is None and order.result is None]
+        return sorted(waiting, key=self._last_begun)
 
-    def _waits(self, place: Place) -> str:
+    def _last_begun(self, order_id: OrderId) -> float:
+        return max(self._begun[order_id[0]], default=0.0)
+
+    def _why_waiting(self, order_id: OrderId) -> str:
         """The progress of an order that waits. Of others it says only how many there are."""
-        if place[0] in self._at_work:
+        running = self._running()
+        if order_id[0] in running:
             return "waiting for other packages of your key"
-        before = self._next().index(place)
-        return f"waiting for others' packages: {before} before it, {len(self._at_work)} at work"
+        before = self._waiting().index(order_id)
+        return f"waiting for others' packages: {before} before it, {len(running)} at work"
 
-    def _is_at(self, place: Place) -> bool:
-        work = self._at_work.get(place[0])
-        return work is not None and work.place == place
-
-    def _begin(self, place: Place, in_use: Collection[str]) -> None:
+    def _begin(self, order_id: OrderId, in_use: Collection[str]) -> None:
         assert self._folder is not None
-        folder = self._folder / place[0]
-        now = monotonic()
+        now, home, order = monotonic(), order_id[0], self._orders[order_id]
+        folder = self._folder / home
         self._handed = {
-            at: (runtime, when)
-            for at, (runtime, when) in self._handed.items()
+            handed: (runtime, when)
+            for handed, (runtime, when) in self._handed.items()
             if runtime.packages in in_use or now - when < _HANDED_S
         }
-        keep = [name for home, name in self._handed if home == place[0]]
-        order = self._line[place].plain | {
+        request = order.plain | {
             "folder": str(folder.absolute()),
             "bytes": self._quotas.packages_bytes,
-            "keep": keep,
+            "keep": [name for owner, name in self._handed if owner == home],
         }
-        self._begun.setdefault(place[0], deque(maxlen=MAX_PER_HOUR)).append(now)
+        self._begun[home].append(now)
         try:
             make_passable(folder)
-            self._at_work[place[0]] = PackageProgram(place, order)
+            order.program = PackageProgram(request)
         except OSError as error:  # a full disk, no process left: the client reads it, once
             text = f"the program that makes packages cannot be started: {error.strerror}"
-            self._end(place, {"error": "other", "said": text}, now)
+            self._end(order_id, {"error": "other", "said": text}, now)
 
-    def _follow(self, work: PackageProgram, now: float) -> None:
-        order = self._line[work.place]
-        said, code = work.said(), work.code
+    def _follow(self, order_id: OrderId, order: Order, program: PackageProgram, now: float) -> None:
+        output, code = program.output(), program.code
         if code is None:
-            order.progress = str(said.get("progress", order.progress))
-            late = now - work.since > self._make_s
-            if work.ended_at is None and (late or now - order.asked > _FORGOTTEN_S):
-                work.terminate(now)
-            elif work.ended_at is not None and now - work.ended_at > _STOP_S:
-                work.kill()
+            order.progress = str(output.get("progress", order.progress))
+            late = now - program.since > self._make_s
+            if program.ended_at is None and (late or now - order.asked > _FORGOTTEN_S):
+                program.terminate(now)
+            elif program.ended_at is not None and now - program.ended_at > _STOP_S:
+                program.kill()
             return
-        del self._at_work[work.place[0]]
-        work.close()
-        if work.ended_at is not None:
+        program.close()
+        if program.ended_at is not None:
             text = (
                 f"they were not installed in time: the server permits {self._make_s:.0f} s "
                 "(--packages-s)"
             )
-            said = {"error": "index", "said": text}
-        elif not said.keys() & {"own", "made", "error"}:
+            output = {"error": "index", "said": text}
+        elif not output.keys() & {"own", "made", "error"}:
             text = f"the program that makes packages ended with {code}; its server's log says why"
-            said = {"error": "other", "said": text}
-        self._end(work.place, said, work.since)
+            output = {"error": "other", "said": text}
+        self._end(order_id, output, program.since)
 
-    def _end(self, place: Place, said: Mapping[str, Any], since: float) -> None:
-        now = monotonic()
-        order = self._line.pop(place)
-        self._outcomes[place] = said, now
-        self._news.append((order.owner, now - since, said))
-        while len(self._outcomes) > _REMEMBERED:
-            self._outcomes.popitem(last=False)
+    def _end(self, order_id: OrderId, result: Mapping[str, Any], since: float) -> None:
+        now, order = monotonic(), self._orders[order_id]
+        order.program, order.result = None, (result, now)
+        self._news.append((order.owner, now - since, result))
+        self._orders.move_to_end(order_id)
+        finished = [known for known, other in self._orders.items() if other.result is not None]
+        for oldest in finished[:-_REMEMBERED]:
+            del self._orders[oldest]
 
 
 def checked(request: m.NeedPackages) -> dict[str, Any]:
@@ -377,7 +385,7 @@ def checked(request: m.NeedPackages) -> dict[str, Any]:
         "override": (request.override, 2),
         "without": (tuple((name,) for name in request.without), 1),
     }
-    good = all(_are_texts(given, width) for given, width in rows.values())
+    good = all(_are_texts(texts, width) for texts, width in rows.values())
     if not good or max(map(len, (request.supports, request.python, request.exclude_newer))) > (
         MAX_TEXT
     ):
@@ -386,7 +394,7 @@ def checked(request: m.NeedPackages) -> dict[str, Any]:
             f"an order has at most {MAX_REQUIREMENTS} rows of texts of {MAX_TEXT} characters",
         )
     return {
-        **{name: [list(row) for row in given] for name, (given, _) in rows.items()},
+        **{name: [list(row) for row in texts] for name, (texts, _) in rows.items()},
         "supports": request.supports,
         "python": request.python,
         "exclude_newer": request.exclude_newer,
@@ -402,13 +410,3 @@ def _are_texts(rows: tuple[Any, ...], width: int) -> bool:
         and all(type(text) is str and len(text) <= MAX_TEXT for text in row)
         for row in rows
     )
-
-
-def _not_here(request: m.NeedPackages) -> m.Packages:
-    if request.always:
-        raise RefusedError(
-            "PolicyError",
-            "dependencies: this server installs no packages; start it with --dependencies, or in "
-            "an interpreter that has them",
-        )
-    return m.Packages("own", "", {}, "this server makes no environments (--dependencies)")
