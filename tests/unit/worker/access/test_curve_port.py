@@ -23,26 +23,31 @@ def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
         yield made
 
 
+def open_to_all(router: zmq.Socket[bytes]) -> CurvePort:
+    """A port without keys."""
+    loop, log = Loop(lambda error: None), Log(lambda line: None)
+    return CurvePort(router, loop, None, lambda key, address: True, log, 10)
+
+
 @pytest.mark.parametrize("goes", [False, True])
 def test_who_has_gone_before_its_greeting_is_read_holds_no_session(
     goes: bool, context: zmq.Context[zmq.Socket[bytes]]
 ) -> None:
     """A server that was busy meanwhile would keep that place for ever. The control stays."""
-    port = CurvePort(None, lambda key, address: True, Log(lambda line: None), 10)
     router, client = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
     with router, client:
-        port.secure(router, Loop(lambda error: None))
+        port = open_to_all(router)
         router.bind("tcp://127.0.0.1:*")
         client.connect(router.get_string(zmq.LAST_ENDPOINT))
         client.send_multipart([b"", b"greeting"])
         assert router.poll(60_000)
         if goes:
             client.close()
-            assert eventually(lambda: not port.open_wires())
+            assert eventually(lambda: not port.connections.open_wires())
         came = port.receive(router)
         sessions = Sessions()
-        session = sessions.connect(came.identity, came.key, b"one", port.wire(came.fd))
-        sessions.disconnect(port.open_wires() or ())
+        session = sessions.connect(came.identity, came.key, b"one", port.connections.wire(came.fd))
+        sessions.disconnect(port.connections.open_wires())
         assert bool(session.connections) is not goes
         port.close()
 
@@ -58,9 +63,8 @@ def test_a_flood_that_nobody_has_read_does_not_keep_a_port_open() -> None:
 
 
 def _flood_and_close() -> None:
-    port = CurvePort(None, lambda key, address: True, Log(lambda line: None), 10)
     with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
-        port.secure(router, Loop(lambda error: None))
+        port = open_to_all(router)
         number = router.bind_to_random_port("tcp://127.0.0.1")
         for _ in range(2_000):
             with knock(number) as stranger:

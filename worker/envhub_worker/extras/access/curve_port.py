@@ -50,42 +50,43 @@ _DROP = struct.pack("=HBBI", 0x06, 0, 0, 0)  # BPF: return 0 bytes of the packet
 
 
 class CurvePort:
-    """What a ``RemoteGate`` does at its socket.
+    """What a ``RemoteGate`` does at its socket: CURVE, and what bounds a peer without rules.
 
     Args:
+        router: Not bound yet.
         keys: The server's key pair; None only for ``--insecure-loopback``.
         admits: Called with a client's public key and address; whether it may come in.
         max_connections: Of everybody together, strangers included.
+
+    Attributes:
+        connections: Those that are open.
     """
 
     def __init__(
         self,
+        router: zmq.Socket[bytes],
+        loop: Loop,
         keys: KeyPair | None,
         admits: Callable[[bytes, str], bool],
         log: Log,
         max_connections: int,
     ) -> None:
         self._keys, self._admits = keys, admits
-        self._log, self._max_connections = log, max_connections
-        self._limiter: ConnectionLimiter | None = None
         self._zap: zmq.Socket[bytes] | None = None
-
-    def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
-        """CURVE, and what bounds a peer that keeps none of the rules."""
         router.setsockopt(zmq.HANDSHAKE_IVL, _HANDSHAKE_MS)
         router.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
         router.setsockopt(zmq.HEARTBEAT_TIMEOUT, _HEARTBEAT_TIMEOUT_MS)
         router.setsockopt(zmq.BACKLOG, _BACKLOG)
         router.setsockopt(zmq.SNDHWM, _SNDHWM)
-        self._limiter = ConnectionLimiter(router, loop, self._log, self._max_connections)
-        if self._keys is None:
+        self.connections = ConnectionLimiter(router, loop, log, max_connections)
+        if keys is None:
             return
         self._zap = router.context.socket(zmq.ROUTER)
         self._zap.setsockopt(zmq.LINGER, 0)
         self._zap.bind(_ENDPOINT)
         loop.watch(self._zap, partial(self._answer, self._zap))
         router.setsockopt(zmq.CURVE_SERVER, 1)
-        router.setsockopt(zmq.CURVE_SECRETKEY, self._keys.secret)
+        router.setsockopt(zmq.CURVE_SECRETKEY, keys.secret)
         router.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN)
         # without it libzmq lets everybody in whom no handler was there to ask about
         router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
@@ -128,25 +129,9 @@ class CurvePort:
         except (zmq.ZMQError, ValueError):
             return b""
 
-    def wire(self, descriptor: int) -> int | None:
-        """The connection that a message came over; None if that is not known."""
-        if self._limiter is None or descriptor < 0:
-            return None
-        return self._limiter.wire(descriptor)
-
-    def open_wires(self) -> frozenset[int] | None:
-        """The connections that are there; None if they are not counted."""
-        return None if self._limiter is None else self._limiter.open_wires()
-
-    def tick(self) -> None:
-        """Time has passed."""
-        if self._limiter is not None:
-            self._limiter.tick()
-
     def close(self) -> None:
         """Close the sockets of the handshakes."""
-        if self._limiter is not None:
-            self._limiter.close()
+        self.connections.close()
         if self._zap is not None:
             self._zap.close()
 
@@ -257,11 +242,11 @@ def _listener(endpoint: str) -> socket.socket | None:
 
 
 def _listens_on(fd: int, port: int) -> bool:
-    found = socket.socket(fileno=fd)
+    theirs = socket.socket(fileno=fd)
     try:
-        if found.family not in (socket.AF_INET, socket.AF_INET6):
+        if theirs.family not in (socket.AF_INET, socket.AF_INET6):
             return False
-        accepts = found.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
-        return bool(accepts) and found.getsockname()[1] == port
+        accepts = theirs.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+        return bool(accepts) and theirs.getsockname()[1] == port
     finally:
-        found.detach()  # it is libzmq's
+        theirs.detach()  # it is libzmq's

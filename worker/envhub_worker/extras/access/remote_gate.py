@@ -52,16 +52,13 @@ class RemoteGate(Gate):
         self._uploads = uploads
         self._packages = packages
         self._log = log
-        self._events = self.witness = Events(
-            log, self._name_of, lambda key: self._tally.open(self._label_of(key))
-        )
+        self._events = self.witness = Events(log, self._name_of, self._count_opened)
         self._in_flight = InFlight()
         self._drain = Drain(rules.drain_s)
         self._publish = publish
         self._unread = ""
         self._tally, self._usage = Tally(), Usage(self._events.failed)
         self._started = time()
-        self._port = CurvePort(rules.keys, self._admits, log, rules.max_connections)
         self.handlers = {
             m.OfferSnapshot: self._offer,
             m.PutBlob: self._put,
@@ -73,7 +70,7 @@ class RemoteGate(Gate):
     def begin(self, sessions: Sessions, jails: Jails) -> None:
         """Clients find their places among these."""
         super().begin(sessions, jails)
-        rules, wires = self._rules, self._port.open_wires
+        rules, wires = self._rules, self._open_wires
         self._places = Places(
             rules.quotas, rules.idle_s, sessions, jails, self._uploads, self._events, wires
         )
@@ -82,7 +79,12 @@ class RemoteGate(Gate):
 
     def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
         """CURVE, and what bounds a peer that keeps none of the rules."""
-        self._port.secure(router, loop)
+        rules = self._rules
+        limits = self._log, rules.max_connections
+        self._port = CurvePort(router, loop, rules.keys, self._admits, *limits)
+
+    def _open_wires(self) -> frozenset[int]:
+        return self._port.connections.open_wires()
 
     def receive(self, router: zmq.Socket[bytes]) -> Incoming:
         """The key is the one that was proved in the handshake, never what the peer claims."""
@@ -104,11 +106,11 @@ class RemoteGate(Gate):
         if len(name) > 64:
             raise RefusedError("LocalProtocolError", "the name of a session is too long")
         self._places.end_deserted()
-        is_new = name not in {one.name for one in self.sessions.of_key(key)}
+        is_new = name not in {session.name for session in self.sessions.of_key(key)}
         if name != WATCHER and is_new:
             self._drain.refuse_new()
         self._places.for_session(key, name)
-        wire = self._port.wire(arrived.fd)
+        wire = self._port.connections.wire(arrived.fd) if arrived.fd >= 0 else None
         session = self.sessions.connect(arrived.identity, key, name, wire)
         if is_new:
             self._events.came(session)
@@ -134,6 +136,9 @@ class RemoteGate(Gate):
     def _name_of(self, key: bytes) -> str | None:
         name = self._rules.authorized.name_of(key)
         return name if name or key not in self._rules.operators else "operator"
+
+    def _count_opened(self, key: bytes) -> None:
+        self._tally.open(self._label_of(key))
 
     def _is_known(self, key: bytes) -> bool:
         rules = self._rules
@@ -172,25 +177,25 @@ class RemoteGate(Gate):
     def _hub_copies(self, key: bytes, request: m.OpenJail) -> tuple[object, ...]:
         """With the paths of snapshots that this client has brought, and no other paths."""
         try:
-            wanted = {copy.tree for copy in request.repositories if copy.tree}
+            trees = {copy.tree for copy in request.repositories if copy.tree}
         except ProtocolError as error:
             raise RefusedError("LocalProtocolError", str(error)) from None
-        return request.with_trees({one: self._uploads.tree(key, one) for one in wanted})
+        return request.with_trees({tree: self._uploads.tree(key, tree) for tree in trees})
 
     def _need(self, asker: Asker, request: m.NeedPackages, payload: Payload) -> m.Message:
         return self._packages.need(asker.key, request, self.jails.packages, asker.session)
 
     def _offer(self, asker: Asker, request: m.OfferSnapshot, payload: Payload) -> m.Message:
         specs = [entry.jail.spec for entry in self.jails.open_ones()]
-        in_use = {one.snapshot for one in specs}
-        in_use |= {copy.tree for one in specs for copy in one.hub_copies}
-        wanted = self._uploads.offer(asker.session, asker.key, request, in_use)
-        if wanted.hashes:
+        in_use = {spec.snapshot for spec in specs}
+        in_use |= {copy.tree for spec in specs for copy in spec.hub_copies}
+        missing = self._uploads.offer(asker.session, asker.key, request, in_use)
+        if missing.hashes:
             sizes = {file[2]: file[1] for file in request.files if isinstance(file, tuple)}
-            size = sum(sizes[sha256] for sha256 in wanted.hashes)
-            digest = wanted.snapshot.removeprefix(PREFIX)
-            self._events.uploads(asker.session, digest, len(wanted.hashes), size)
-        return wanted
+            size = sum(sizes[sha256] for sha256 in missing.hashes)
+            digest = missing.snapshot.removeprefix(PREFIX)
+            self._events.uploads(asker.session, digest, len(missing.hashes), size)
+        return missing
 
     def _put(self, asker: Asker, request: m.PutBlob, payload: Payload) -> m.Message:
         if len(payload) != 1:
@@ -220,25 +225,26 @@ class RemoteGate(Gate):
     def figures(self, key: bytes | None = None) -> dict[str, Any]:
         """What the server has to report: all for an operator, for any other key its own share."""
         clients = ClientFigures()
-        for one in self.sessions.all():
-            if one.name != WATCHER:
-                clients.of(self._label_of(one.key)).sessions += 1
+        sessions = [session for session in self.sessions.all() if session.name != WATCHER]
+        watchers = [session for session in self.sessions.all() if session.name == WATCHER]
+        for session in sessions:
+            clients.of(self._label_of(session.key)).sessions += 1
         for entry in self.jails.open_ones():
             clients.of(self._label_of(_key_of(entry))).add_jail(entry)
-        for known in {one.key for one in self.sessions.all() if one.name != WATCHER}:
-            share = clients.of(self._label_of(known))
-            share.upload_bytes += self._uploads.used_bytes(known)
-            share.inflight_bytes += self._in_flight.of(known)
+        for client_key in {session.key for session in sessions}:
+            share = clients.of(self._label_of(client_key))
+            share.upload_bytes += self._uploads.used_bytes(client_key)
+            share.inflight_bytes += self._in_flight.of(client_key)
         clients.add_past(self._tally, self._usage)
-        found = {**facts_for_clients(self._rules), "draining_s": self._drain.left_s}
+        facts = {**facts_for_clients(self._rules), "draining_s": self._drain.left_s}
         if key is not None and key not in self._rules.operators:
-            return {**found, "clients": clients.plain(self._label_of(key))}
-        looking = sum(len(one.connections) for one in self.sessions.all() if one.name == WATCHER)
+            return {**facts, "clients": clients.plain(self._label_of(key))}
+        looking = sum(len(session.connections) for session in watchers)
         return {
-            **found,
+            **facts,
             **facts_for_operators(self._rules, str(self._uploads.folder)),
             "started": self._started,
-            "connections": max(0, len(self._port.open_wires() or ()) - looking),
+            "connections": max(0, len(self._open_wires()) - looking),
             "waiting": {quota: line.waiting for quota, line in self._places.lines.items()},
             "refusals": dict(self._tally.refusals),
             "deaths": dict(self.jails.deaths),
@@ -247,20 +253,20 @@ class RemoteGate(Gate):
 
     def _sessions_of(self, key: bytes) -> list[dict[str, Any]]:
         self._places.end_deserted()
-        found = self.sessions.all() if key in self._rules.operators else self.sessions.of_key(key)
-        seen = [one for one in found if one.name != WATCHER]  # the one that asks, above all
-        used = {key: self._uploads.used_bytes(key) for key in {one.key for one in seen}}
+        all_of_them = key in self._rules.operators
+        sessions = self.sessions.all() if all_of_them else self.sessions.of_key(key)
         return [
             {
-                "client": self._name_of(one.key) or "operator",
-                "key": key_text(one.key),
-                "session": one.name.hex()[:8],
-                "heard_s": monotonic() - one.heard,
-                "connections": len(one.connections),
-                "upload_bytes": used[one.key],
-                "jails": tuple(self.jails.statuses(one.owner)),
+                "client": self._name_of(session.key) or "operator",
+                "key": key_text(session.key),
+                "session": session.name.hex()[:8],
+                "heard_s": monotonic() - session.heard,
+                "connections": len(session.connections),
+                "upload_bytes": self._uploads.used_bytes(session.key),
+                "jails": tuple(self.jails.statuses(session.owner)),
             }
-            for one in seen
+            for session in sessions
+            if session.name != WATCHER  # the one that asks, above all
         ]
 
     # --- time ----------------------------------------------------------------------------------
@@ -268,7 +274,7 @@ class RemoteGate(Gate):
     def tick(self) -> None:
         """End the jails of clients that are not heard from, and what clients no longer hold."""
         self._log.tick()
-        self._port.tick()
+        self._port.connections.tick()
         self._read_clients()
         for session in self.sessions.all():
             if not self._is_known(session.key):
