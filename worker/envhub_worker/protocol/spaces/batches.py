@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -58,15 +59,23 @@ def is_batch(batched: gym.Space[Any], single: gym.Space[Any], count: int) -> boo
     return True
 
 
+def _mapped(leaf: Callable[..., Any], space: gym.Space[Any], *values: Any) -> Any:
+    """Mappings and tuples like those of the space, with ``leaf(space, *parts)`` of all else."""
+    if isinstance(space, spaces.Dict):
+        items = space.spaces.items()
+        return {key: _mapped(leaf, sub, *(value[key] for value in values)) for key, sub in items}
+    if isinstance(space, spaces.Tuple):
+        return tuple(_mapped(leaf, *parts) for parts in zip(space.spaces, *values, strict=True))
+    return leaf(space, *values)
+
+
+def _item(index: Any, space: gym.Space[Any], batch: Any) -> Any:
+    return batch[index]
+
+
 def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
     """The slices of a batch. Arrays are views."""
-    if isinstance(space, spaces.Dict):
-        named = {key: split(sub, batch[key], bounds) for key, sub in space.spaces.items()}
-        return [{key: part[index] for key, part in named.items()} for index in range(len(bounds))]
-    if isinstance(space, spaces.Tuple):
-        parts = [split(sub, item, bounds) for sub, item in zip(space.spaces, batch, strict=True)]
-        return [tuple(part[index] for part in parts) for index in range(len(bounds))]
-    return [batch[start:stop] for start, stop in bounds]
+    return [_mapped(partial(_item, slice(*window)), space, batch) for window in bounds]
 
 
 def members(
@@ -74,7 +83,7 @@ def members(
 ) -> Iterable[Any]:
     """Gymnasium's ``iterate``, which finds no members where a mapping or a tuple is empty."""
     if _has_empty(space):
-        return (_member(space, batch, index) for index in range(count))
+        return (_mapped(partial(_item, index), space, batch) for index in range(count))
     return iterate(batched, batch)
 
 
@@ -86,22 +95,12 @@ def _has_empty(space: gym.Space[Any]) -> bool:
     )
 
 
-def _member(space: gym.Space[Any], batch: Any, index: int) -> Any:
-    if isinstance(space, spaces.Dict):
-        return {key: _member(sub, batch[key], index) for key, sub in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        pairs = zip(space.spaces, batch, strict=True)
-        return tuple(_member(sub, item, index) for sub, item in pairs)
-    return batch[index]
-
-
 def reordered(space: gym.Space[Any], batch: Any, order: Sequence[int]) -> Any:
     """The same members of a batch in another order; lists and tuples stay what they are."""
-    if isinstance(space, spaces.Dict):
-        return {key: reordered(sub, batch[key], order) for key, sub in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        pairs = zip(space.spaces, batch, strict=True)
-        return tuple(reordered(sub, item, order) for sub, item in pairs)
+    return _mapped(partial(_reordered, order), space, batch)
+
+
+def _reordered(order: Sequence[int], space: gym.Space[Any], batch: Any) -> Any:
     if isinstance(batch, np.ndarray):
         return batch[np.asarray(order)]
     return type(batch)(batch[index] for index in order)
@@ -109,14 +108,13 @@ def reordered(space: gym.Space[Any], batch: Any, order: Sequence[int]) -> Any:
 
 def join(space: gym.Space[Any], parts: Sequence[Any]) -> Any:
     """One batch out of the shards' slices, in order."""
+    return _mapped(_joined, space, *parts)
+
+
+def _joined(space: gym.Space[Any], *parts: Any) -> Any:
     if isinstance(space, ARRAY_SPACES):
         return np.concatenate(parts)
-    if isinstance(space, spaces.Dict):
-        return {key: join(sub, [part[key] for part in parts]) for key, sub in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        members = enumerate(space.spaces)
-        return tuple(join(sub, [part[index] for part in parts]) for index, sub in members)
-    return tuple(member for part in parts for member in part)
+    return tuple(itertools.chain.from_iterable(parts))
 
 
 def conforms(space: gym.Space[Any], batch: Any, count: int) -> bool:
@@ -200,15 +198,11 @@ def integers(space: gym.Space[Any], member: Any) -> list[bool]:
 
 def with_integers(space: gym.Space[Any], member: Any, which: Iterator[bool]) -> Any:
     """The member with those for which the next of ``which`` is true; the other way round."""
-    if isinstance(space, spaces.Discrete):
-        return int(member) if next(which, False) else member
-    if isinstance(space, spaces.Dict):
-        subspaces = space.spaces
-        return {key: with_integers(sub, member[key], which) for key, sub in subspaces.items()}
-    if isinstance(space, spaces.Tuple):
-        each = zip(space.spaces, member, strict=True)
-        return tuple(with_integers(sub, member, which) for sub, member in each)
-    return member
+
+    def restored(space: gym.Space[Any], member: Any) -> Any:
+        return int(member) if isinstance(space, spaces.Discrete) and next(which, False) else member
+
+    return _mapped(restored, space, member)
 
 
 def join_infos(
@@ -317,18 +311,18 @@ def _gather_part(
     joined: dict[Any, Any], part: dict[Any, Any], window: slice, count: int, max_bytes: int
 ) -> None:
     for key, value in part.items():
-        known: Any = joined.get(key)
-        if isinstance(value, dict) and (known is None or isinstance(known, dict)):
+        column: Any = joined.get(key)
+        if isinstance(value, dict) and (column is None or isinstance(column, dict)):
             _gather_part(joined.setdefault(key, {}), value, window, count, max_bytes)
             continue
         is_array = isinstance(value, np.ndarray)
-        if known is None and is_array and value.nbytes * count <= max_bytes * len(value):
-            known = joined[key] = _blank(value, count)
-        if not (is_array and _is_like(known, value)):
-            if not _is_like(known, _NOTHING):
-                known = joined[key] = _members(joined, key, count)
+        if column is None and is_array and value.nbytes * count <= max_bytes * len(value):
+            column = joined[key] = _blank(value, count)
+        if not (is_array and _is_like(column, value)):
+            if not _is_like(column, _NOTHING):
+                column = joined[key] = _members(joined, key, count)
             value = _members(part, key, window.stop - window.start)
-        known[window] = value
+        column[window] = value
 
 
 _NOTHING = np.full(1, None, dtype=object)
@@ -538,11 +532,10 @@ def restores(space: gym.Space[Any]) -> bool:
 
 def restore_batch(space: gym.Space[Any], batch: Any) -> Any:
     """A batch that ``conforms``, with the classes that Gymnasium gives its members."""
-    if isinstance(space, spaces.Dict):
-        return {key: restore_batch(sub, batch[key]) for key, sub in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        pairs = zip(space.spaces, batch, strict=True)
-        return tuple(restore_batch(sub, item) for sub, item in pairs)
+    return _mapped(_restored, space, batch)
+
+
+def _restored(space: gym.Space[Any], batch: Any) -> Any:
     return tuple(restore(space, member) for member in batch) if isinstance(batch, tuple) else batch
 
 
