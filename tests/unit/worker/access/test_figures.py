@@ -7,6 +7,7 @@ import subprocess
 import pytest
 
 from envhub_worker.extras.access.audit import figures
+from envhub_worker.lockdown.mechanisms import procfs
 from tests.support.processes import eventually
 
 
@@ -16,7 +17,7 @@ def test_what_processes_use_is_added_up_by_client(monkeypatch: pytest.MonkeyPatc
     shell = ["sh", "-c", "i=0; while [ $i -lt 200000 ]; do i=$((i+1)); done; cat; :"]
     with subprocess.Popen(shell, stdin=subprocess.PIPE) as process:
         taken = figures.Usage(pytest.fail)
-        assert eventually(lambda: len(figures.children(process.pid)) == 1)
+        assert eventually(lambda: len(procfs.descendants(process.pid)) == 1)
         found, again = (figures.look_at(process.pid) for _ in range(2))
         assert found is not None
         assert again is not None

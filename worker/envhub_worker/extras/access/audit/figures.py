@@ -38,7 +38,6 @@ REFUSALS = (
 _OTHER = "other"
 _NAME_CHARS = 64
 EVERY_S = 5.0
-_MOST_PROCESSES = 65_536
 _TICKS_A_S = os.sysconf("SC_CLK_TCK")
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 _USER, _SYSTEM, _STARTED, _RESIDENT = 11, 12, 19, 21
@@ -173,16 +172,12 @@ class Usage:
 
 def _members(jails: Mapping[int, str]) -> Iterator[tuple[Process, str]]:
     """All processes of the jails: each one's first, and what it has below it."""
-    known = set[int]()
+    children = procfs.all_children() if jails else {}
     for first, client in jails.items():
-        waiting = [first]
-        while waiting and len(known) < _MOST_PROCESSES:
-            pid = waiting.pop()
-            found = None if pid in known else look_at(pid)
-            if found is not None:
-                known.add(pid)
-                yield found, client
-                waiting += children(pid)
+        for pid in (first, *procfs.descendants(first, children=children)):
+            process = look_at(pid)
+            if process is not None:
+                yield process, client
 
 
 def look_at(pid: int) -> Process | None:
@@ -202,15 +197,6 @@ def _share(pid: int, resident: int) -> int:
     with contextlib.suppress(OSError):
         return procfs.numbers(f"/proc/{pid}/smaps_rollup").get(b"Pss", resident)
     return resident
-
-
-def children(pid: int) -> list[int]:
-    """The numbers of a process's children; none where the kernel does not tell."""
-    found = list[int]()
-    with contextlib.suppress(OSError):
-        for thread in os.listdir(f"/proc/{pid}/task"):
-            found += map(int, procfs.content(f"/proc/{pid}/task/{thread}/children").split())
-    return found
 
 
 @dataclass
@@ -261,7 +247,7 @@ class ClientFigures:
     def plain(self, name: str | None = None) -> Mapping[str, Any]:
         """As plain values: of everybody, or of one."""
         chosen = self.shares if name is None else {name: self.of(name)}
-        return {one: asdict(share) for one, share in chosen.items()}
+        return {client: asdict(share) for client, share in chosen.items()}
 
 
 def client_name(name: str | None, insecure: bool) -> str:
