@@ -44,33 +44,24 @@ class MetricsPage:
 
     def answer(self, path: str) -> Reply:
         """The page of that path."""
+        if path not in ("/metrics", "/healthz", "/readyz"):
+            return 404, _TEXT, b"/metrics, /healthz, /readyz\n"
         published = self._published  # another thread replaces it
-        wrong = self._wrong(published)
-        if path == "/metrics" and published is not None and not wrong:
-            return self._metrics(published[1])
-        if path in ("/metrics", "/healthz"):
-            return 503 if wrong else 200, _TEXT, f"{wrong or 'well'}\n".encode()
-        if path == "/readyz":
-            wrong = wrong or self._unready(published)
-            return 503 if wrong else 200, _TEXT, f"{wrong or 'ready'}\n".encode()
-        return 404, _TEXT, b"/metrics, /healthz, /readyz\n"
-
-    def _metrics(self, figures: Mapping[str, Any]) -> Reply:
-        """Made once for each publication: to ask often costs the server nothing."""
-        if self._rendered is None or self._rendered[0] is not figures:
-            self._rendered = figures, (200, *self._render(figures))
-        return self._rendered[1]
-
-    def _wrong(self, published: tuple[float, Mapping[str, Any]] | None) -> str:
-        if published is None:
-            return "it has only just been started"
-        age_s = self._clock() - published[0]
-        return f"its loop has not run for {age_s:.0f} s" if age_s > STALE_S else ""
-
-    def _unready(self, published: tuple[float, Mapping[str, Any]] | None) -> str:
-        if published is not None and _drains(published[1]):
-            return "it drains: it accepts nothing new"
-        return "" if self._usable else "no jail can be opened here: see its log, or envhub doctor"
+        age_s, figures = (0.0, None) if published is None else published
+        wrong, right = "", "ready" if path == "/readyz" else "well"
+        if figures is None:
+            wrong = "it has only just been started"
+        elif self._clock() - age_s > STALE_S:
+            wrong = f"its loop has not run for {self._clock() - age_s:.0f} s"
+        elif path == "/metrics":
+            if self._rendered is None or self._rendered[0] is not figures:  # once a publication
+                self._rendered = figures, (200, *self._render(figures))
+            return self._rendered[1]
+        elif path == "/readyz" and _drains(figures):
+            wrong = "it drains: it accepts nothing new"
+        elif path == "/readyz" and not self._usable:
+            wrong = "no jail can be opened here: see its log, or envhub doctor"
+        return 503 if wrong else 200, _TEXT, f"{wrong or right}\n".encode()
 
 
 def _drains(figures: Mapping[str, Any]) -> bool:
@@ -145,13 +136,13 @@ class ServerCollector:
     def _of_clients(self, clients: Mapping[str, Any]) -> Iterator[Any]:
         for table in (_CLIENT_GAUGES, _CLIENT_COUNTERS):
             for name, key, text in table:
-                rows = [([who], one[key]) for who, one in clients.items()]
+                rows = [([client], share[key]) for client, share in clients.items()]
                 counts = table is _CLIENT_COUNTERS
                 yield _family(name, text, ("client",), rows, counts=counts)
         rows = [
-            ([who, word], value)
-            for who, one in clients.items()
-            for word, value in one["requests"].items()
+            ([client, word], value)
+            for client, share in clients.items()
+            for word, value in share["requests"].items()
         ]
         text = "What clients asked of their environments."
         labels = ("client", "operation")
