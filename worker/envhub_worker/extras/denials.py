@@ -65,8 +65,8 @@ def asked(
         with open(f"/proc/{thread}/mem", "rb", buffering=0) as memory:
             still_waits()  # after opening: the descriptor pins this caller's memory
             if call in _ADDRESS:
-                place, size = (words[index] for index in _ADDRESS[call])
-                path = _addressed(memory, place, size, thread, own)
+                address, size = (words[index] for index in _ADDRESS[call])
+                path = _addressed(memory, address, size, thread, own)
                 harmless = not path or path in _HARMLESS or _is_within(path, own.changed)
                 return [] if harmless else [(call, _shown(path))]
             deed, last = _deed(call, words)
@@ -179,9 +179,9 @@ def _link(thread: int, folder: str, names: Sequence[str]) -> str:
         os.close(descriptor)
 
 
-def _addressed(memory: BinaryIO, place: int, size: int, thread: int, own: OwnPaths) -> str:
+def _addressed(memory: BinaryIO, start: int, size: int, thread: int, own: OwnPaths) -> str:
     """The socket's file; one without a name in the file system is the jail's own network's."""
-    address = os.pread(memory.fileno(), min(size & 0xFFFFFFFF, _SOCKET_ADDRESS), place)
+    address = os.pread(memory.fileno(), min(size & 0xFFFFFFFF, _SOCKET_ADDRESS), start)
     text = address[2:].partition(b"\0")[0]
     if address[:2] != struct.pack("=H", _AF_UNIX) or not text:
         return ""

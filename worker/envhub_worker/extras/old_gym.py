@@ -315,9 +315,9 @@ _SPACES: dict[str, Callable[[Any], Any]] = {
     "Discrete": lambda space: spaces.Discrete(int(space.n), start=int(getattr(space, "start", 0))),
     "MultiDiscrete": lambda space: spaces.MultiDiscrete(space.nvec, dtype=space.dtype),
     "MultiBinary": lambda space: spaces.MultiBinary(space.n),
-    "Tuple": lambda space: spaces.Tuple([space_of(one) for one in space.spaces]),
+    "Tuple": lambda space: spaces.Tuple([space_of(part) for part in space.spaces]),
     "Dict": lambda space: spaces.Dict(
-        OrderedDict((key, space_of(one)) for key, one in space.spaces.items())
+        OrderedDict((key, space_of(part)) for key, part in space.spaces.items())
     ),
 }
 
@@ -352,10 +352,8 @@ def _where(env: Any, method: str) -> str:
     """A method as its author finds it."""
     name = f"{type(env).__qualname__}.{method}"
     code = getattr(getattr(type(env), method), "__code__", None)
-    return f"{name} ({_relative(code.co_filename)}, line {code.co_firstlineno})" if code else name
-
-
-def _relative(name: str) -> str:
-    """A file as its repository calls it."""
+    if code is None:
+        return name
     roots = [f"{root.rstrip(os.sep)}{os.sep}" for root in sys.path if root]
-    return next((name.removeprefix(root) for root in roots if name.startswith(root)), name)
+    root = next((root for root in roots if code.co_filename.startswith(root)), "")
+    return f"{name} ({code.co_filename.removeprefix(root)}, line {code.co_firstlineno})"

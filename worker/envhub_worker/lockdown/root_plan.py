@@ -107,12 +107,12 @@ def plan_root(
     """
     links: dict[str, str] = dict(_DEV_LINKS)
     named = {path: {path, resolve(path, host, {})} for path in interpreter}  # and what it leads to
-    wanted = [
+    shown = [
         path
         for path, both in named.items()
         if not any(within(path, other) for path in private for other in both)
     ]
-    trees = [*wanted, *readable, *_ETC_FOLDERS, *_SYS_FOLDERS, *_SYSTEM]
+    trees = [*shown, *readable, *_ETC_FOLDERS, *_SYS_FOLDERS, *_SYSTEM]
     copies = list(_ETC_FILES)
     texts = dict(_TEXTS)
     if network == "host":
@@ -165,11 +165,18 @@ def resolve(path: str, host: HostFiles, links: dict[str, str]) -> str:
     return current
 
 
+def _readlink(path: str) -> str | None:
+    return os.readlink(path) if os.path.islink(path) else None
+
+
+def _listdir(path: str) -> list[str]:
+    return sorted(os.listdir(path)) if os.path.isdir(path) else []
+
+
+def _read(path: str) -> str:
+    return procfs.text(path) or ""
+
+
 def real_host() -> HostFiles:
     """This host's files."""
-    return HostFiles(
-        exists=os.path.exists,
-        readlink=lambda path: os.readlink(path) if os.path.islink(path) else None,
-        listdir=lambda path: sorted(os.listdir(path)) if os.path.isdir(path) else [],
-        read=lambda path: procfs.text(path) or "",
-    )
+    return HostFiles(exists=os.path.exists, readlink=_readlink, listdir=_listdir, read=_read)

@@ -58,23 +58,21 @@ def confinement_from_wire(data: dict[str, Any]) -> Confinement:
     names = {item.name for item in fields(Confinement)}
     if set(data) != names:
         raise RemoteProtocolError("a confinement has other fields")
-    checked = {"limits": _limits(data["limits"]), "gpu": _gpu(data["gpu"])}
-    confinement = Confinement(**{**data, "readable": tuple(_texts(data["readable"])), **checked})
-    valid = confinement.profile in PROFILES and confinement.network in NETWORKS
-    valid = valid and confinement.display in DISPLAYS and type(confinement.record_denials) is bool
-    if (
-        not valid
-        or len(confinement.readable) > _MAX_READABLE
-        or not _may_be_granted(confinement.environment)
-    ):
-        raise RemoteProtocolError("a confinement that there cannot be")
-    return confinement
-
-
-def _texts(value: Any) -> Any:
-    if type(value) not in (list, tuple) or not all(type(item) is str for item in value):
+    readable = data["readable"]
+    if type(readable) not in (list, tuple) or not all(type(path) is str for path in readable):
         raise RemoteProtocolError("readable paths are a list of strings")
-    return value
+    checked = {"limits": _limits(data["limits"]), "gpu": _gpu(data["gpu"])}
+    confinement = Confinement(**{**data, "readable": tuple(readable), **checked})
+    if (
+        confinement.profile in PROFILES
+        and confinement.network in NETWORKS
+        and confinement.display in DISPLAYS
+        and type(confinement.record_denials) is bool
+        and len(readable) <= _MAX_READABLE
+        and _may_be_granted(confinement.environment)
+    ):
+        return confinement
+    raise RemoteProtocolError("a confinement that there cannot be")
 
 
 def _gpu(value: Any) -> bool | tuple[int, ...]:

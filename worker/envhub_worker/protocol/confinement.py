@@ -4,7 +4,7 @@ end, and what a container says that holds around its server.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import field
 from typing import Any, Literal, get_args
 
@@ -138,19 +138,19 @@ class Surroundings:
 
         Unknown profiles are left out. Trust: input from the worker.
         """
-        fields = {
-            name: _READERS[kind](document[name]) for name, kind in cls.__annotations__.items()
+        fields: dict[str, Any] = {
+            name: _read(kind, document[name]) for name, kind in cls.__annotations__.items()
         }
         profiles = tuple(name for name in fields.pop("profiles") if name in PROFILES)
         return cls(profiles=profiles, **fields)
 
 
-_READERS: dict[str, Callable[[Any], Any]] = {
-    "bool": lambda said: said is True,
-    "int": int,
-    "int | None": lambda said: None if said is None else int(said),
-    "float | None": lambda said: None if said is None else float(said),
-    "str": str,
-    "tuple[str, ...]": lambda said: tuple(str(name)[:_MAX_NAME] for name in said),
-}
-"""By the annotation of a field, as it is written above."""
+def _read(kind: str, value: Any) -> Any:
+    """A value as the annotation of its field says."""
+    if kind == "bool":
+        return value is True
+    if kind == "tuple[str, ...]":
+        return tuple(str(name)[:_MAX_NAME] for name in value)
+    if value is None and kind.endswith(" | None"):
+        return None
+    return {"int": int, "float": float, "str": str}[kind.removesuffix(" | None")](value)

@@ -55,7 +55,7 @@ class _Signature:
                 Parameter(
                     field.name,
                     Parameter.KEYWORD_ONLY if field.kw_only else Parameter.POSITIONAL_OR_KEYWORD,
-                    default=defaults.get(field.name, lambda: Parameter.empty)(),
+                    default=defaults[field.name]() if field.name in defaults else Parameter.empty,
                     annotation=field.type,
                 )
                 for field in dataclasses.fields(cls)

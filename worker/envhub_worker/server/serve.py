@@ -66,7 +66,11 @@ def _serve_in(arguments: argparse.Namespace) -> int:
     raise_file_limit()
     gc.freeze()
     gc.enable()
-    announced = _announced() if arguments.announce else None
+    announced = None
+    if arguments.announce:
+        from envhub_worker.lockdown import probe
+
+        announced = probe.announcement(probe.surroundings())
     server = Server(
         arguments.endpoint,
         arguments.runtime_dir,
@@ -99,9 +103,3 @@ def _ahead(arguments: argparse.Namespace) -> ZygoteProcess | None:
         return ZygoteProcess(runtime, arguments.runtime_dir, granted, ahead=True)
     except OSError:  # opening a jail in that interpreter says why
         return None
-
-
-def _announced() -> str:
-    from envhub_worker.lockdown import probe
-
-    return probe.announcement(probe.surroundings())

@@ -162,17 +162,17 @@ class Server:
         except Exception as error:
             if not isinstance(error, ProtocolError):  # that is the client's mistake
                 self._gate.witness.failed(error)
-            said = f"{type(error).__name__} on the server: {error}"
-            said = shortage(error, "on the server") or said
-            self.reply(asker, RefusedError("WorkerError", said).reply)
+            text = f"{type(error).__name__} on the server: {error}"
+            text = shortage(error, "on the server") or text
+            self.reply(asker, RefusedError("WorkerError", text).reply)
 
     def _refuse_unread(self, identity: bytes, key: bytes, frame: Any, error: Exception) -> None:
         """Answer a request that cannot be read, if at least its id can be."""
         number = m.id_of(frame)
         if number is None:
             return  # not our protocol
-        said = str(error) if isinstance(error, ProtocolError) else type(error).__name__
-        refused = RefusedError("LocalProtocolError", f"the request cannot be read: {said}")
+        text = str(error) if isinstance(error, ProtocolError) else type(error).__name__
+        refused = RefusedError("LocalProtocolError", f"the request cannot be read: {text}")
         self.reply(Asker(identity, number, b"", key), refused.reply)
 
     def _dispatch(self, asker: Asker, request: m.Message, arrived: Incoming) -> m.Message | None:
@@ -224,8 +224,8 @@ class Server:
 
     def _agree(self, asker: Asker, request: m.Agree) -> None:
         """Answer before it holds, so that the answer itself can be read."""
-        known = compression.available() if self._gate.compresses else ()
-        chosen = next((name for name in request.compressions if name in known), "")
+        possible = compression.available() if self._gate.compresses else ()
+        chosen = next((name for name in request.compressions if name in possible), "")
         self.reply(asker, m.Agreement(str(chosen), self._gate.idle_s))
         self._sessions.agree(asker.identity, asker.key, str(chosen))
 

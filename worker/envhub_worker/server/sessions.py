@@ -116,7 +116,7 @@ class Sessions:
     def idle(self, idle_s: float) -> list[Session]:
         """Sessions that have not been heard from for so long."""
         now = self._clock()
-        return [one for one in self._sessions.values() if now - one.heard > idle_s]
+        return [session for session in self._sessions.values() if now - session.heard > idle_s]
 
     def drop(self, session: Session) -> None:
         """Forget a session and its connections."""

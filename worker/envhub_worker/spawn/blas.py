@@ -56,8 +56,8 @@ def _thread_count(runners: int) -> int:
 def threads_at_load(runners: int) -> Iterator[None]:
     """What OpenBLAS shall read, where a runner itself loads it; nothing of it stays behind."""
     count = str(_thread_count(runners))
-    wanted = {"OPENBLAS_NUM_THREADS": count, "OPENBLAS_THREAD_TIMEOUT": THREAD_TIMEOUT}
-    fresh = {name: value for name, value in wanted.items() if name not in os.environ}
+    variables = {"OPENBLAS_NUM_THREADS": count, "OPENBLAS_THREAD_TIMEOUT": THREAD_TIMEOUT}
+    fresh = {name: value for name, value in variables.items() if name not in os.environ}
     os.environ.update(fresh)
     try:
         yield

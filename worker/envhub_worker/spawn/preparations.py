@@ -75,8 +75,8 @@ def check_display(spec: JailSpec, environment: Mapping[str, str]) -> None:
     """Look for the program that a display needs, before anything is given up.
     Raises ``LayerUnavailableError``: the policy asks for a display, and it is not there.
     """
-    wanted = spec.confinement.display == "virtual"
-    if wanted and shutil.which(_PROGRAM, path=environment.get("PATH")) is None:
+    is_virtual = spec.confinement.display == "virtual"
+    if is_virtual and shutil.which(_PROGRAM, path=environment.get("PATH")) is None:
         raise LayerUnavailableError(
             "display",
             f"a virtual display needs {_PROGRAM}, which is not installed where the jail runs",
@@ -255,7 +255,6 @@ _MODULES: dict[str, Callable[[], dict[str, Any]]] = {
     **dict.fromkeys(("lerobot", "lerobot.utils"), dict),
     **dict.fromkeys(("lerobot.envs", "lerobot.envs.configs"), _configs),
     **dict.fromkeys(("lerobot.configs", "lerobot.configs.types"), _types),
-    "lerobot.utils.constants": lambda: _CONSTANTS,
-    "lerobot.constants": lambda: _CONSTANTS,
+    **dict.fromkeys(("lerobot.utils.constants", "lerobot.constants"), _CONSTANTS.copy),
 }
 """What each module of the stub has."""

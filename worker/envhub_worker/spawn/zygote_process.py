@@ -79,8 +79,8 @@ class ZygoteProcess:
     def serves(self, runtime: Runtime, granted: Mapping[str, str]) -> bool:
         """Whether it was started as the zygote of such jails would be."""
         runtime = resolved(runtime)
-        wanted = zygote_environment(os.environ, runtime.python, at_start(granted))
-        return (self.runtime, self.environment) == (runtime, wanted)
+        environment = zygote_environment(os.environ, runtime.python, at_start(granted))
+        return (self.runtime, self.environment) == (runtime, environment)
 
     def wait(self) -> int:
         """Its exit code; it is killed if it does not end by itself soon."""

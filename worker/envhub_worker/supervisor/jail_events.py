@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from time import monotonic
 
 from envhub_worker.lockdown.limits.cgroups import OUTER_LIMIT, SurroundingLimit
@@ -58,12 +59,12 @@ class JailEvents:
 
     def follow(self, entry: JailRecord) -> None:
         """Hear of a new jail from now on."""
-        self._watch(entry, entry.control, lambda: self._jail_events(entry))
-        self._watch(entry, entry.output.fileno(), lambda: self._read_output(entry))
+        self._watch(entry, entry.control, partial(self._jail_events, entry))
+        self._watch(entry, entry.output.fileno(), partial(self._read_output, entry))
 
     def follow_runner(self, entry: JailRecord, runner: int) -> None:
         """Hear of a new runner from now on."""
-        self._watch(entry, entry.links[runner].fileno(), lambda: self._runner_ready(entry, runner))
+        self._watch(entry, entry.links[runner].fileno(), partial(self._runner_ready, entry, runner))
 
     def _watch(self, entry: JailRecord, fd: int, callback: Callable[[], None]) -> None:
         self._loop.watch(fd, self._guarded(entry, callback))
@@ -97,7 +98,7 @@ class JailEvents:
         assert link.slabs is not None
         link.sent += len(frame)
         link.slabs.ask(frame, owner)
-        self._steps.owe(link.slabs, self._guarded(entry, lambda: self._stepped(entry, link)))
+        self._steps.owe(link.slabs, self._guarded(entry, partial(self._stepped, entry, link)))
 
     def _stepped(self, entry: JailRecord, link: RunnerLink) -> None:
         """A runner has answered; nobody may wait for that any more."""
@@ -226,7 +227,7 @@ class JailEvents:
         entry.output.read()
         death = m.replace(death, tail=entry.output.text())
         # the last lines of earlier deaths were sent already: all of them would be much
-        entry.lost = {runner: m.replace(one, tail="") for runner, one in entry.lost.items()}
+        entry.lost = {runner: m.replace(lost, tail="") for runner, lost in entry.lost.items()}
         entry.lost[death.runner] = death
         entry.jail.kill_runner(death.runner)  # it may live, and have broken the rules
         entry.pids.pop(death.runner, None)
@@ -241,9 +242,10 @@ class JailEvents:
             self.gather(pending)
         self._part_with(link)
         link.close()
-        for opening in [one for one in entry.opening if death.runner in one.waiting]:
-            entry.opening.remove(opening)
-            self._reply(opening.asker, m.replace(death, operation="start"))
+        for opening in list(entry.opening):
+            if death.runner in opening.waiting:
+                entry.opening.remove(opening)
+                self._reply(opening.asker, m.replace(death, operation="start"))
         self._witness.lost(entry, death)
 
     def end(self, entry: JailRecord, death: m.Death) -> None:
@@ -294,7 +296,7 @@ class JailEvents:
 
     def jail_gone(self, event: JailExited) -> None:
         """Nothing of a jail is left: answer the requests that wait for that."""
-        entry = next((one for one in self._jails.values() if one.jail is event.jail), None)
+        entry = next((jail for jail in self._jails.values() if jail.jail is event.jail), None)
         if entry is None:
             return
         if entry.closing:

@@ -13,6 +13,7 @@ import os
 import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -154,9 +155,9 @@ class Jails:
             raise RefusedError("WorkerError", f"{len(entry.lost)} of its runners have died")
         self._start_runners(asker, entry, request.runners)
 
-    def _check_zygotes(self, asker: Asker, wanted: _Zygote) -> None:
+    def _check_zygotes(self, asker: Asker, zygote: _Zygote) -> None:
         held = {entry.zygote for entry in self.open_ones(asker.key)}
-        if not self._local and wanted not in held and len(held) >= MAX_REMOTE_ZYGOTES:
+        if not self._local and zygote not in held and len(held) >= MAX_REMOTE_ZYGOTES:
             raise RefusedError(
                 "WorkerError",
                 f"your key has jails of {len(held)} kinds, by their packages, policies and "
@@ -175,13 +176,13 @@ class Jails:
 
     def _wire_limits(self, entry: JailRecord) -> WireLimits:
         """What its client permits; where that is somebody on another host, no more than ours."""
-        wanted = entry.jail.spec.confinement.limits.message_bytes
-        return limits_for(wanted if self._local else min(wanted, DEFAULT_LIMITS.message_bytes))
+        most = entry.jail.spec.confinement.limits.message_bytes
+        return limits_for(most if self._local else min(most, DEFAULT_LIMITS.message_bytes))
 
     def _output_bytes(self, confinement: Confinement) -> int:
         """As ``_wire_limits``: the server itself keeps them."""
-        wanted = confinement.limits.output_bytes
-        return wanted if self._local else min(wanted, MAX_SERVED_OUTPUT)
+        most = confinement.limits.output_bytes
+        return most if self._local else min(most, MAX_SERVED_OUTPUT)
 
     def _start_runners(self, asker: Asker, entry: JailRecord, count: int) -> None:
         runners = []
@@ -344,7 +345,7 @@ class Jails:
                 runtime=runtime,
                 ahead=ahead,
             )
-            self._loop.watch(spawner.fileno(), lambda: self._poll(zygote))
+            self._loop.watch(spawner.fileno(), partial(self._poll, zygote))
         self._spawners[zygote] = spawner  # the one that was used last is the last
         return spawner
 
@@ -404,9 +405,9 @@ def _held(entry: JailRecord, children: Children | None) -> dict[str, object]:
 
 def _note_limits(entry: JailRecord, usage: dict[str, int]) -> None:
     """What a jail has used up it is denied; in front, where no flood of attempts hides it."""
-    wanted = entry.jail.spec.confinement
-    runners, own_root = entry.jail.runner_pids(), wanted.profile == "strict"
-    limits = set(reached(wanted.limits, usage, runners, own_root=own_root))
+    confinement = entry.jail.spec.confinement
+    runners, own_root = entry.jail.runner_pids(), confinement.profile == "strict"
+    limits = set(reached(confinement.limits, usage, runners, own_root=own_root))
     if entry.jail.refused_processes():
         limits.add("PROCESSES")
     for name in sorted(limits):

@@ -11,6 +11,7 @@ import signal
 import traceback
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from time import monotonic
 from typing import Any, NamedTuple
 
@@ -298,7 +299,7 @@ def _state_of(pid: int) -> str:
 def status_of(entry: JailRecord) -> dict[str, object]:
     """What a jail is doing, for ``Status``."""
     owed = [pending for link in entry.links.values() for pending, _ in link.owed]
-    oldest = min(owed, key=lambda pending: pending.since, default=None)
+    oldest = min(owed, key=attrgetter("since"), default=None)
     # in the order of the runners: they come up side by side, and say so in any order
     pids = tuple(entry.pids[runner] for runner in sorted(entry.pids))
     return {

@@ -97,17 +97,16 @@ class RunnerLink:
         while self._unsent:
             batch = [self._unsent[i] for i in range(min(len(self._unsent), _MAX_IOVECS))]
             try:
-                self._drop(self.sock.sendmsg(batch, (), socket.MSG_NOSIGNAL))
+                sent = self.sock.sendmsg(batch, (), socket.MSG_NOSIGNAL)
             except BlockingIOError:
                 return
             except OSError:
                 self._unsent.clear()
-
-    def _drop(self, sent: int) -> None:
-        while self._unsent and sent >= self._unsent[0].nbytes:
-            sent -= self._unsent.popleft().nbytes
-        if sent:
-            self._unsent[0] = self._unsent[0][sent:]
+                return
+            while self._unsent and sent >= self._unsent[0].nbytes:
+                sent -= self._unsent.popleft().nbytes
+            if sent:
+                self._unsent[0] = self._unsent[0][sent:]
 
     def receive(self) -> list[tuple[Packet, Any]] | None:
         """The replies that have arrived with their owners, or None at the end of the stream.

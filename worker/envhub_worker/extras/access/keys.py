@@ -94,8 +94,8 @@ class AuthorizedClients:
         """
         if self._path is None:
             return False
-        found = self._path.stat()
-        stamp = found.st_ino, found.st_mtime_ns, found.st_size
+        status = self._path.stat()
+        stamp = status.st_ino, status.st_mtime_ns, status.st_size
         if stamp == self._stamp:
             if self._wrong:
                 raise ValueError(self._wrong)

@@ -10,6 +10,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 from envhub_worker.extras.access.audit.log import Events, Log
 from envhub_worker.extras.access.quotas import RETRY_S, BusyError, Quotas, Use, check_jail, use_of
@@ -18,7 +19,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages.server import DRAINING, Busy
 from envhub_worker.server.sessions import WATCHER, Session, Sessions
 from envhub_worker.supervisor.jails import Jails
-from envhub_worker.supervisor.records import Asker, JailRecord
+from envhub_worker.supervisor.records import Asker
 
 _PATIENCE_S = 5.0
 _MAX_WAITING = 1024
@@ -51,29 +52,30 @@ class Line:
         """How many mean to wait: they have asked more than once, and not long ago."""
         now = self._clock()
         return sum(
-            one.times > 1 and now - one.asked <= _PATIENCE_S
+            client.times > 1 and now - client.asked <= _PATIENCE_S
             for waiting in self._waiting.values()
-            for one in waiting.values()
+            for client in waiting.values()
         )
 
     def ahead(self, key: bytes, owner: bytes) -> int:
         """How many wait that have come before."""
         waiting, now = self._waiting.get(key, OrderedDict()), self._clock()
-        for name in [name for name, one in waiting.items() if now - one.asked > _PATIENCE_S]:
-            del waiting[name]
+        for name, client in list(waiting.items()):
+            if now - client.asked > _PATIENCE_S:
+                del waiting[name]
         before = 0
-        for name, one in waiting.items():
+        for name, client in waiting.items():
             if name == owner:
                 break
-            before += one.times > 1
+            before += client.times > 1
         return before
 
     def wait(self, key: bytes, owner: bytes) -> None:
         """A client is to ask again."""
         waiting = self._waiting.setdefault(key, OrderedDict())
-        known = waiting.get(owner)
-        if known is not None:
-            known.asked, known.times = self._clock(), known.times + 1
+        client = waiting.get(owner)
+        if client is not None:
+            client.asked, client.times = self._clock(), client.times + 1
         elif len(waiting) < _MAX_WAITING:
             waiting[owner] = _Waiting(self._clock())
 
@@ -114,7 +116,7 @@ class Places:
     def for_session(self, key: bytes, name: bytes) -> None:
         """Hold a session against the quota."""
         of_key = self._sessions.of_key(key)
-        others = [one for one in of_key if one.name not in (name, WATCHER)]
+        others = [session for session in of_key if session.name not in (name, WATCHER)]
         quota = self._quotas.sessions
         if name != WATCHER and len(others) >= quota:
             gone = longest_gone(others)
@@ -125,7 +127,7 @@ class Places:
                     f"your key has {quota} sessions, which is the server's quota (--max-sessions)",
                 )
             self.end(gone, _PLACE_NEEDED)
-        elif name not in {one.name for one in of_key}:
+        elif name not in {session.name for session in of_key}:
             self._refuse_behind("sessions", key, name, len(others), quota)
         self.lines["sessions"].leave(key, name)
 
@@ -140,8 +142,8 @@ class Places:
             except BusyError:
                 self._disconnect()
                 # its own may look so, too: what it said last is read after it has gone
-                others = [one for one in self._sessions.of_key(key) if one.owner != asker.session]
-                gone = longest_gone(others)
+                sessions = self._sessions.of_key(key)
+                gone = longest_gone([other for other in sessions if other.owner != asker.session])
                 if gone is None:
                     if "jails" in more:
                         self.lines["jails"].wait(key, asker.session)
@@ -188,7 +190,13 @@ class Places:
         self.end_deserted()
         # First: a client that times out in the loop below would otherwise be logged as having
         # released its jails.
-        given_up = self._given_up() if self._idle_s else []
+        sessions = self._sessions.all() if self._idle_s else []
+        given_up = [
+            entry
+            for session in sessions
+            for entry in self._jails.open_ones(session.owner)
+            if self._sessions.unheld(session, entry.number, self._idle_s)
+        ]
         for session in self._sessions.idle(self._idle_s or _FORGOTTEN_S):
             if self._idle_s:
                 self.end(session, f"its client has sent nothing for {self._idle_s} s")
@@ -213,14 +221,6 @@ class Places:
         if wires is not None:
             self._sessions.disconnect(wires)
 
-    def _given_up(self) -> list[JailRecord]:
-        return [
-            entry
-            for session in self._sessions.all()
-            for entry in self._jails.open_ones(session.owner)
-            if self._sessions.unheld(session, entry.number, self._idle_s)
-        ]
-
     def end(self, session: Session, why: str) -> None:
         """End a session and its jails."""
         for entry in self._jails.open_ones(session.owner):
@@ -236,8 +236,8 @@ class Places:
 
 def longest_gone(sessions: Sequence[Session]) -> Session | None:
     """The session without a connection that was heard from the longest ago, if there is one."""
-    gone = [one for one in sessions if not one.connections]
-    return min(gone, key=lambda one: one.heard, default=None)
+    gone = [session for session in sessions if not session.connections]
+    return min(gone, key=attrgetter("heard"), default=None)
 
 
 class Drain:

@@ -125,12 +125,12 @@ def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permi
         )
     if confinement.gpu is not False and not permitted.gpu:
         raise RefusedError("PolicyError", "a GPU needs a server that was started with --allow-gpu")
-    asked, weakest = confinement.profile, permitted.weakest_profile
-    if asked not in PROFILES or PROFILES.index(asked) > PROFILES.index(weakest):
+    profile, weakest = confinement.profile, permitted.weakest_profile
+    if profile not in PROFILES or PROFILES.index(profile) > PROFILES.index(weakest):
         raise RefusedError(
             "PolicyError",
-            f"profile {asked[:20]!r} needs a server that was started with "
-            f"--weakest-profile {asked[:20]}; this one permits nothing weaker than {weakest!r}",
+            f"profile {profile[:20]!r} needs a server that was started with "
+            f"--weakest-profile {profile[:20]}; this one permits nothing weaker than {weakest!r}",
         )
 
 
@@ -144,18 +144,15 @@ def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
         if used + added > quota:
             shown = size_text if name.endswith("_bytes") else str
             short = name.removesuffix("_bytes").replace("_", " ")
+            counted = f"of {short} limits" if name in _LIMITED else short
             text = (
-                f"this would make {shown(used + added)} {_counted(name, short)} of your key, over "
+                f"this would make {shown(used + added)} {counted} of your key, over "
                 f"the server's quota of {shown(quota)} (--max-{short.replace(' ', '-')}); close "
                 "environments, or lower their limits"
             )
             if not uses:
                 raise RefusedError("WorkerError", text)  # no waiting makes it fit
             raise BusyError(Busy(short.replace(" ", "_"), used, quota, RETRY_S), text)
-
-
-def _counted(name: str, short: str) -> str:
-    return f"of {short} limits" if name in _LIMITED else short
 
 
 @mutable_dataclass
@@ -188,11 +185,11 @@ class InFlight:
 
     def answered(self, asker: Asker) -> None:
         """A request was answered: this very one, not another under the same id."""
-        place = (asker.identity, asker.request_id)
-        counted, key, size = self._requests.get(place, (None, b"", 0))
+        request = (asker.identity, asker.request_id)
+        counted, key, size = self._requests.get(request, (None, b"", 0))
         if counted is not asker:
             return
-        del self._requests[place]
+        del self._requests[request]
         self._of[key] -= size
         if not self._of[key]:
             del self._of[key]

@@ -77,21 +77,21 @@ def version() -> int:
         return 0
 
 
-def restrict(wanted: Ruleset, rules: Iterable[LandlockRule]) -> None:
-    """Enforce ``wanted`` on this thread for good. ``no_new_privs`` must be set.
+def restrict(handled: Ruleset, rules: Iterable[LandlockRule]) -> None:
+    """Enforce ``handled`` on this thread for good. ``no_new_privs`` must be set.
 
     A rule whose path does not exist is left out: it would permit nothing.
     Raises ``LayerUnavailableError``: the kernel refuses.
     """
     try:
-        words = struct.pack("=QQQ", wanted.files, wanted.tcp, wanted.scope)
+        words = struct.pack("=QQQ", handled.files, handled.tcp, handled.scope)
         # A kernel refuses a structure that is longer than its own, unless the rest is zero; the
         # first ones know the first field only.
-        size = 24 if wanted.scope else 16 if wanted.tcp else 8
+        size = 24 if handled.scope else 16 if handled.tcp else 8
         fd = kernel.syscall("landlock_create_ruleset", words, size, 0)
         try:
             for rule in rules:
-                _add(fd, rule, wanted.files)
+                _add(fd, rule, handled.files)
             kernel.syscall("landlock_restrict_self", fd, 0)
         finally:
             os.close(fd)

@@ -51,9 +51,9 @@ def place_for_sockets() -> Path:
 
 def remove_deserted(parent: Path) -> None:
     """Remove folders of ours whose server has gone."""
-    for path in filter(lambda path: _NAME.fullmatch(path.name), parent.iterdir()):
+    for path in parent.iterdir():
         with contextlib.suppress(OSError):
-            if path.lstat().st_uid == os.geteuid():
+            if _NAME.fullmatch(path.name) and path.lstat().st_uid == os.geteuid():
                 with unheld(path / _LOCK):
                     remove_tree(str(path))
 

@@ -19,6 +19,7 @@ import signal
 import socket
 import struct
 from collections.abc import Callable, Collection
+from functools import partial
 
 from envhub_worker.lockdown.mechanisms import kernel, procfs
 from envhub_worker.lockdown.seccomp.policy import WITHOUT_ATTRIBUTES, refusal
@@ -94,7 +95,7 @@ def serve(listener: int, permitted: Collection[str], note: Callable[[Request], N
     if call in permitted and call not in WITHOUT_ATTRIBUTES:
         answer = _PROCEED
     elif call in _SIGNALS:
-        answer = decide(request, lambda: procfs.descendants(os.getpid()))
+        answer = decide(request, partial(procfs.descendants, os.getpid()))
     else:
         answer = refusal(call)
     result, flags = (0, _CONTINUE) if answer == _PROCEED else (-answer, 0)

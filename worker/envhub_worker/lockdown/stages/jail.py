@@ -51,7 +51,12 @@ def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, View]:
 
 def _mount(spec: JailSpec, common: Common) -> View:
     limits = spec.confinement.limits
-    _check_snapshot(spec, common)
+    if not any(within(spec.snapshot, path) for path in (*common.root.roots, *common.root.trees)):
+        raise LayerUnavailableError(
+            "mount-namespace",
+            f"the snapshot {spec.snapshot} is in none of the readable roots",
+            "Start the worker with --readable-root for the folder with the snapshots.",
+        )
     namespaces.unshare_for_jail(common.config.network)
     view = mounts.mount_jail(
         spec.snapshot,
@@ -107,15 +112,6 @@ def working_view(view: View) -> Layer:
         path, why = next(iter(view.refused.items()))
         detail = f"links into the repository; {path} is read-only: {why}"
     return Layer("working-view", True, detail)
-
-
-def _check_snapshot(spec: JailSpec, common: Common) -> None:
-    if not any(within(spec.snapshot, path) for path in (*common.root.roots, *common.root.trees)):
-        raise LayerUnavailableError(
-            "mount-namespace",
-            f"the snapshot {spec.snapshot} is in none of the readable roots",
-            "Start the worker with --readable-root for the folder with the snapshots.",
-        )
 
 
 def _check_readable(spec: JailSpec) -> None:

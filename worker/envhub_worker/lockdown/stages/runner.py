@@ -87,8 +87,8 @@ def enter(
     process.drop_capabilities()
     process.set_no_new_privileges()
     if jail.common.landlock_abi:
-        wanted = landlock.ruleset(jail.common.landlock_abi, jail.common.config.network)
-        landlock.restrict(wanted, rules(jail, os.getpid()))
+        ruleset = landlock.ruleset(jail.common.landlock_abi, jail.common.config.network)
+        landlock.restrict(ruleset, rules(jail, os.getpid()))
     program = jail.common.programs[jail.measured]
     asks = jail.common.brokered or jail.common.config.record
     listener = filter.install(program, brokered=asks)
@@ -181,25 +181,25 @@ def _self_test(jail: JailContext, descriptors: Iterable[int]) -> None:
 def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
     init = os.getppid()
     denials: dict[str, Callable[[], object]] = {
-        "no user namespace can be made": lambda: kernel.unshare(kernel.CLONE_NEWUSER),
-        "nothing can be mounted": lambda: kernel.mount("none", "/tmp", "tmpfs"),
-        "init cannot be traced": lambda: kernel.syscall("ptrace", _PTRACE_ATTACH, init, 0, 0),
-        "init's limits cannot be changed": lambda: kernel.syscall(
-            "prlimit64", init, resource.RLIMIT_CORE, 0, 0
+        "no user namespace can be made": partial(kernel.unshare, kernel.CLONE_NEWUSER),
+        "nothing can be mounted": partial(kernel.mount, "none", "/tmp", "tmpfs"),
+        "init cannot be traced": partial(kernel.syscall, "ptrace", _PTRACE_ATTACH, init, 0, 0),
+        "init's limits cannot be changed": partial(
+            kernel.syscall, "prlimit64", init, resource.RLIMIT_CORE, 0, 0
         ),
     }
     if jail.spec.snapshot in jail.view.refused:
         entry = os.path.join(jail.spec.snapshot, jail.spec.entry)
-        denials["the snapshot cannot be written"] = lambda: os.open(entry, os.O_WRONLY)
+        denials["the snapshot cannot be written"] = partial(os.open, entry, os.O_WRONLY)
     for path in jail.view.refused:
         denials[f"{path} cannot be written"] = partial(_make_unnamed, path)
     if jail.common.landlock_abi or jail.common.namespaced:
         canary = jail.common.config.canary
-        denials["files outside cannot be read"] = lambda: os.open(canary, os.O_RDONLY)
+        denials["files outside cannot be read"] = partial(os.open, canary, os.O_RDONLY)
     if landlock.scopes(jail.common.landlock_abi) or jail.common.brokered:
-        denials["init cannot be signalled"] = lambda: os.kill(init, 0)
+        denials["init cannot be signalled"] = partial(os.kill, init, 0)
     if jail.common.config.network == "none":
-        denials["no internet socket can be made"] = lambda: socket.socket(socket.AF_INET)
+        denials["no internet socket can be made"] = partial(socket.socket, socket.AF_INET)
     return denials
 
 
@@ -214,7 +214,7 @@ def _stays_inside(path: str, shared: int) -> bool:
     try:
         with contextlib.suppress(OSError):  # where a runner before filled the scratch, for example
             os.close(os.open(f"{path}/{name}", os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
-        return not _is_there(name, shared) and _denied(lambda: _make_unnamed(".", shared))
+        return not _is_there(name, shared) and _denied(partial(_make_unnamed, ".", shared))
     finally:
         with contextlib.suppress(OSError):
             os.unlink(f"{path}/{name}")

@@ -134,10 +134,12 @@ def _numpy_writer() -> Callable[[Encoder, Any], object]:
 def _headed(code: int, *names: str) -> Callable[[Encoder, Any], object]:
     """A head and the attributes of these names; the elements, where none is named."""
     head = _HEADS[code]
-    if not names:
-        return lambda encoder, value: [head, *value]
-    parts = attrgetter(*names)
-    return lambda encoder, value: [head, *parts(value)]
+    parts = attrgetter(*names) if names else iter
+
+    def write(encoder: Encoder, value: Any) -> object:
+        return [head, *parts(value)]
+
+    return write
 
 
 _HEADS = {code: msgpack.ExtType(code, b"") for code in range(wire.TUPLE, wire.GENERATOR + 1)}
@@ -194,19 +196,18 @@ def encode(
         LocalProtocolError: The value is cyclic, too deep, too large, or holds a dtype that
             cannot cross. The text names the path to the offender. Nothing was sent.
     """
-    try:
-        frames = Encoder(pickler, limits, describer).frames(value)
+
+    def send(part: object) -> list[Buffer]:
+        frames = Encoder(pickler, limits, describer).frames(part)
         if reduces:
             wire.check_outgoing_frames(frames, limits)
+        return frames
+
+    try:
+        frames = send(value)
     # Objects' own code runs here (__array__, iteration): anything can come out of it.
     except Exception as error:
         from envhub_worker.protocol.codec.unsendable import explain, reduced
-
-        def send(part: object) -> list[Buffer]:
-            frames = Encoder(pickler, limits, describer).frames(part)
-            if reduces:
-                wire.check_outgoing_frames(frames, limits)
-            return frames
 
         if reduces and type(value) is list:
             with contextlib.suppress(Exception):

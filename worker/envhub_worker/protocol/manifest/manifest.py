@@ -177,12 +177,12 @@ def _decode_env(value: object, reader: SpaceReader) -> EnvManifest:
     if not 1 <= num_envs <= MAX_NUM_ENVS:
         raise RemoteProtocolError(f"num_envs is {num_envs}, outside 1..{MAX_NUM_ENVS}")
     spaces = {name: reader.space(fields[name]) for name in _SPACES}
-    mode = fields["autoreset_mode"]
+    mode, task = fields["autoreset_mode"], fields["task"]
     if mode is not None and (type(mode) is not str or mode not in AUTORESET_MODES):
         raise RemoteProtocolError(f"autoreset mode {str(mode)[:40]!r} is not one of Gymnasium's")
     return EnvManifest(
         suite=checked_key(fields["suite"], "suite"),
-        task=_task(fields["task"]),
+        task=task if type(task) is int else checked_key(task, "task"),
         num_envs=num_envs,
         shardable=_typed(fields, "shardable", bool),
         sync=_typed(fields, "sync", bool),
@@ -207,10 +207,6 @@ def _typed(fields: Mapping[str, Any], name: str, kind: type) -> Any:
     if type(fields[name]) is not kind:
         raise RemoteProtocolError(f"{name} is not of type {kind.__name__}")
     return fields[name]
-
-
-def _task(value: object) -> TaskId:
-    return value if type(value) is int else checked_key(value, "task")
 
 
 def _attributes(value: object) -> tuple[str, ...]:
@@ -238,7 +234,8 @@ def read_metadata_facts(value: object) -> dict[str, Any]:
     return {
         key: item
         for key, item in metadata.items()
-        if key not in _METADATA_OF_GYMNASIUM or _METADATA_OF_GYMNASIUM[key](item)
+        if key != "autoreset_mode"  # a field of its own says it
+        and (key not in _METADATA_OF_GYMNASIUM or _METADATA_OF_GYMNASIUM[key](item))
     }
 
 
@@ -271,7 +268,6 @@ def _are_modes(value: object) -> bool:
 _METADATA_OF_GYMNASIUM: dict[str, Callable[[object], bool]] = {
     "render_fps": _is_rate,
     "render_modes": _are_modes,
-    "autoreset_mode": lambda value: False,  # a field of its own says it
 }
 
 

@@ -235,7 +235,8 @@ def _box_key(name: object, shape: object, *arrays: object) -> tuple[object, ...]
 
 def _read_discrete(reader: SpaceReader, n: object, start: object, name: object) -> Space:
     dtype = _dtype(name, INTEGER_DTYPES)
-    least, most = _integer_range(dtype)
+    info = np.iinfo(dtype)
+    least, most = int(info.min), min(int(info.max), MAX_INT64)
     count, first = _integer(n, 1, most), _integer(start, least, most)
     if first + count - 1 > most:
         raise RemoteProtocolError("A Discrete space ends beyond its dtype.")
@@ -325,11 +326,6 @@ def _integer(value: object, least: int, most: int) -> int:
     if type(value) is not int or not least <= value <= most:
         raise RemoteProtocolError("A space's number is not an integer in its range.")
     return value
-
-
-def _integer_range(dtype: np.dtype[Any]) -> tuple[int, int]:
-    info = np.iinfo(dtype)
-    return int(info.min), min(int(info.max), MAX_INT64)
 
 
 def _dtype(name: object, allowed: dict[str, np.dtype[Any]]) -> np.dtype[Any]:

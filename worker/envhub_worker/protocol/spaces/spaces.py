@@ -151,15 +151,17 @@ def seeded_states(space: Space, single: Space | None = None) -> States | None:
     Returns:
         None if there is nothing to tell.
     """
-    if single is not None and not all(map(_may_be_batched, seeded_nodes(single))):
-        return None
+    known = (*ARRAY_SPACES, spaces.Dict, spaces.Tuple)  # seeded in a batch only if they are
+    for node in seeded_nodes(single) if single is not None else ():
+        if not isinstance(node, known) and _state(node) is None:
+            return None
     states: States = []
     first: dict[int, int] = {}
     for index, node in enumerate(seeded_nodes(space)):
         state = _state(node)
-        # one that several share: the place of the first
-        place = first.setdefault(id(getattr(node, "_np_random", None)), index)
-        states.append(state if state is None or place == index else place)
+        # of one that several share: the index of the first
+        sharer = first.setdefault(id(getattr(node, "_np_random", None)), index)
+        states.append(state if state is None or sharer == index else sharer)
     return states if any(state is not None for state in states) else None
 
 
@@ -173,13 +175,6 @@ def _parts_of(space: Space) -> tuple[Space, ...]:
     if isinstance(space, spaces.Graph):
         return (space.node_space, *(() if space.edge_space is None else (space.edge_space,)))
     return ()
-
-
-def _may_be_batched(space: Space) -> bool:
-    """Whether the generators of its batch are seeded only if it is."""
-    return (
-        isinstance(space, (*ARRAY_SPACES, spaces.Dict, spaces.Tuple)) or _state(space) is not None
-    )
 
 
 def entropy_of(bits: Any) -> Any:

@@ -57,8 +57,8 @@ def text_line(when: float, level: str, event: str, fields: Fields) -> str:
 
 def json_line(when: float, level: str, event: str, fields: Fields) -> str:
     """An object with ``time``, ``level``, ``event`` and the fields, which have other names."""
-    said = {name: _bounded(name, value) for name, value in fields.items()}
-    return json.dumps({"time": _time(when), "level": level, "event": event, **said})
+    bounded = {name: _bounded(name, value) for name, value in fields.items()}
+    return json.dumps({"time": _time(when), "level": level, "event": event, **bounded})
 
 
 FORMS: dict[str, Form] = {"text": text_line, "json": json_line}
@@ -167,7 +167,7 @@ class Events(Witness):
 
     def left(self, session: Session, why: str) -> None:
         """Its session is forgotten."""
-        self._in_line -= {one for one in self._in_line if one[0] == session.owner}
+        self._in_line -= {entry for entry in self._in_line if entry[0] == session.owner}
         level = "debug" if session.name == WATCHER else "info"
         seconds = monotonic() - session.since
         self._client(session.owner, "client_left", level, why=why, seconds=seconds)
@@ -177,23 +177,23 @@ class Events(Witness):
         fields = {"snapshot": snapshot, "files": files, "bytes": size}
         self._client(owner, "upload", "info", **fields)
 
-    def packages(self, owner: bytes, seconds: float, said: Mapping[str, Any]) -> None:
+    def packages(self, owner: bytes, seconds: float, result: Mapping[str, Any]) -> None:
         """The program that makes packages has ended; what it says quotes a client."""
-        made = said.get("made")
-        fields = {name: made[name] for name in ("name", "bytes")} if made else {}
-        if "error" in said:
-            fields = {"error": said["error"], "why": said["said"]}
-        level = "warning" if "error" in said else "info"
+        environment = result.get("made")
+        fields = {name: environment[name] for name in ("name", "bytes")} if environment else {}
+        if "error" in result:
+            fields = {"error": result["error"], "why": result["said"]}
+        level = "warning" if "error" in result else "info"
         self._client(owner, "packages", level, seconds=seconds, **fields)
 
     def refused(self, asker: Asker, refused: m.Refusal) -> None:
         """A request was not done. Who waits in line asks every second: that is said once."""
         owner, level = asker.session or asker.key, "warning"
         fields: dict[str, object] = {"error": refused.error, "why": refused.message}
-        if found := refused.busy:
-            fields |= {"quota": found.quota, "used": found.used, "limit": found.limit}
-            level = "debug" if (owner, found.quota) in self._in_line else level
-            self._in_line.add((owner, found.quota))
+        if busy := refused.busy:
+            fields |= {"quota": busy.quota, "used": busy.used, "limit": busy.limit}
+            level = "debug" if (owner, busy.quota) in self._in_line else level
+            self._in_line.add((owner, busy.quota))
         elif refused.error == "DependencyError":
             fields |= {"reason": refused.missing}
         elif refused.missing:
@@ -205,7 +205,7 @@ class Events(Witness):
     def opened(self, entry: JailRecord, runners: int, seconds: float) -> None:
         """A jail has come up, or further runners in it."""
         spec = entry.jail.spec
-        self._in_line -= {one for one in self._in_line if one[0] == entry.session}
+        self._in_line -= {line for line in self._in_line if line[0] == entry.session}
         fields = {**_jail(entry), "runners": runners, "seconds": seconds}
         if entry.opened:
             self._client(entry.session, "runners_started", "info", **fields)

@@ -27,11 +27,11 @@ def state_folder(chosen: Path | None) -> Iterator[Path]:
     if folder is not None:
         yield folder
         return
-    made = LockedFolder("envhub-state-")
+    temporary = LockedFolder("envhub-state-")
     try:
-        yield made.path
+        yield temporary.path
     finally:
-        made.remove()
+        temporary.remove()
 
 
 def state_dir(chosen: Path | None, *, create: bool) -> Path | None:
@@ -61,11 +61,11 @@ def _make_private(folder: Path) -> None:
     folder.mkdir(mode=0o711 if os.getuid() == 0 else 0o700, parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK):
         raise PermissionError(f"{folder} cannot be written")
-    found = folder.stat()
-    if found.st_uid != os.getuid() or found.st_mode & 0o022:
+    status = folder.stat()
+    if status.st_uid != os.getuid() or status.st_mode & 0o022:
         raise PermissionError(
             f"the state folder {folder} holds keys, and others can change it: it belongs to uid "
-            f"{found.st_uid} and has mode {stat.S_IMODE(found.st_mode):04o}. Give it to uid "
+            f"{status.st_uid} and has mode {stat.S_IMODE(status.st_mode):04o}. Give it to uid "
             f"{os.getuid()} and chmod go-w it, or let --state-dir name a new one"
         )
 
@@ -75,9 +75,9 @@ def _is_ours(folder: Path) -> bool:
 
     One that we own and cannot write is a read-only container's, and no server's.
     """
-    found = folder.lstat()
-    ours = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid()
-    return ours and not found.st_mode & 0o022 and os.access(folder, os.W_OK)
+    status = folder.lstat()
+    ours = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid()
+    return ours and not status.st_mode & 0o022 and os.access(folder, os.W_OK)
 
 
 class ServerNote(NamedTuple):

@@ -103,7 +103,8 @@ def _ask(
         socket.connect(endpoint)
         _request(socket, m.Hello(m.VERSION, WATCHER), 1, m.Welcome)
         reply = _request(socket, m.GetSessions(), 2, m.Sessions)
-    return [dict(one) for one in reply.sessions if isinstance(one, dict)], reply.server
+    sessions = [dict(session) for session in reply.sessions if isinstance(session, dict)]
+    return sessions, reply.server
 
 
 def of_server(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> dict[str, Any]:
@@ -149,13 +150,14 @@ def head(server: dict[str, Any]) -> str:
 def table(sessions: list[dict[str, Any]]) -> str:
     """Sessions and their jails, one line each."""
     lines = [counted(len(sessions), "session")]
-    for one in sessions:
+    for session in sessions:
         lines.append(
-            f"{one['client']} {one['session']}: heard {one['heard_s']:.0f} s ago, "
-            f"{counted(one['connections'], 'connection')}, {size_text(one['upload_bytes'])} of "
-            f"snapshots, {counted(len(one['jails']), 'jail')}"
+            f"{session['client']} {session['session']}: heard {session['heard_s']:.0f} s ago, "
+            f"{counted(session['connections'], 'connection')}, "
+            f"{size_text(session['upload_bytes'])} of snapshots, "
+            f"{counted(len(session['jails']), 'jail')}"
         )
-        for jail in one["jails"]:
+        for jail in session["jails"]:
             doing = f"{jail['operation']} for {jail['busy_s']:.1f} s" if jail["operation"] else "-"
             lines.append(f"  {jail['name']}: {', '.join(jail['states'])}; {doing}")
     # line by line: a name is a client's, and neither ends its line nor crowds out another's

@@ -106,7 +106,7 @@ class BlobStore:
         real = os.path.realpath(self.home / "trees")
         used = {os.path.realpath(path) for path in in_use}
         names = [name for name in self._trees if os.path.join(real, name) not in used]
-        return sorted(names, key=lambda name: _modified(self.tree(name)))
+        return [name for _, name in sorted((_modified(self.tree(name)), name) for name in names)]
 
     def remove(self, digest: str) -> None:
         """Remove a tree."""
@@ -153,8 +153,8 @@ class BlobStore:
 
 def _is_there(path: Path, size: int) -> bool:
     with contextlib.suppress(OSError):
-        found = path.lstat()
-        return stat.S_ISREG(found.st_mode) and found.st_size == size
+        status = path.lstat()
+        return stat.S_ISREG(status.st_mode) and status.st_size == size
     return False
 
 

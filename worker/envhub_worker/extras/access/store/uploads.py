@@ -21,6 +21,7 @@ import os
 import re
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -167,16 +168,16 @@ class Uploads:
             self._finish(owner, offer, request.sha256)
 
     def _begin(self, owner: bytes, home: Path, request: m.PutBlob, size: int) -> Partial:
-        place = (owner, request.sha256)
-        partial = self._partial.get(place)
+        partial = self._partial.get((owner, request.sha256))
         if partial is None or request.offset == 0:
-            mine = sum(1 for known, _ in self._partial if known == owner)
+            mine = sum(bringer == owner for bringer, _ in self._partial)
             if partial is None and mine >= MAX_PARTIAL:
                 raise RefusedError("WorkerError", f"{MAX_PARTIAL} files are on their way already")
             make_passable(home)
             (home / "parts").mkdir(mode=0o700, exist_ok=True)
             name = hashlib.sha256(owner + request.sha256).hexdigest()
-            partial = self._partial[place] = Partial(home / "parts" / name, size)
+            partial = Partial(home / "parts" / name, size)
+            self._partial[owner, request.sha256] = partial
             partial.path.write_bytes(b"")
         return partial
 
@@ -196,8 +197,9 @@ class Uploads:
     def forget(self, owner: bytes) -> None:
         """A client has gone: what it had begun is removed."""
         self._offers.pop(owner, None)
-        for known, sha256 in [place for place in self._partial if place[0] == owner]:
-            self._give_up(known, sha256)
+        for bringer, sha256 in list(self._partial):
+            if bringer == owner:
+                self._give_up(owner, sha256)
 
     def tree(self, key: bytes, snapshot: str) -> str:
         """The path of a client's snapshot. Raises ``RefusedError`` where it is not here."""
@@ -269,7 +271,7 @@ def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[ListedFil
             f"a snapshot has 1 to {quotas.upload_files} files here (--max-upload-files), this one "
             f"has {len(files)}",
         )
-    listed = sorted((_listed(file) for file in files), key=lambda file: file.path)
+    listed = sorted((_listed(file) for file in files), key=attrgetter("path"))
     total = sum(file.size for file in listed)
     if total > quotas.upload_bytes:
         raise RefusedError(
