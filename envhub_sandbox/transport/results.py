@@ -36,6 +36,8 @@ class Results:
         apart: Whether infos are to come as each sub-environment gave them, under its place; what
             began in the step that ended an episode, under ``count`` more. The environment is then
             built for that.
+        looks_inside: Whether more is checked of an observation than its classes, dtypes and shapes,
+            or made of it.
         max_bytes: How much larger than what the workers sent their infos may be when joined.
     """
 
@@ -51,6 +53,7 @@ class Results:
         self.slices = [(start - first, stop - first) for start, stop in bounds]
         self.count = sum(self._sizes)
         self._restores = batches.restores(self._space)
+        self.looks_inside = self._declared or self._restores
 
     def step(self, replies: list[m.StepDone], infos: dict[Any, Any] | None = None) -> StepResult:
         """What ``VectorEnv.step`` returns; with these infos, if there are other ones.

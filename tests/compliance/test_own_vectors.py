@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import gymnasium as gym
 import gymnasium.error as gym_errors
@@ -20,6 +21,7 @@ from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.shared_memory import lane
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.shared_memory.columns import StepColumns
 from tests.support import inside
 from tests.support.compare import assert_same
 from tests.support.in_process.interrupts import before_line
@@ -419,19 +421,22 @@ class Batch(gym.vector.VectorEnv):
         n, at = self.num_envs, self.count
         if at == 5:
             raise ValueError(f"no step {at}")
-        rewards = torch.as_tensor(actions).sum(1) if at % 3 else actions.sum(1)
+        steady = at > 20  # but for its ends of episodes
+        rewards = torch.as_tensor(actions).sum(1) if at % 3 and not steady else actions.sum(1)
         done = np.arange(n) == at % n
         infos = {
             "distance": np.arange(n) / (at + 1), "_distance": ~done,
             "log": {"loss": at / 3, "steps": at, "name": "run", "grad": torch.full((2,), at)},
+            "best": np.float32(at / 7), "own": [at % 2 == 0, (None, np.int16(at)), f"{at}"],
+            "time": 0 if steady else np.datetime64(at, "ns"),
         }
         if at % 4 == 1:
             finals = np.full(n, None, dtype=object)
             finals[at % n] = {name: part[0] for name, part in self.seen().items()}
             infos |= {"final_obs": finals, "_final_obs": done, "final_info": {"r": done * 0.5}}
-        if at % 7 == 6:
+        if at % 7 == 6 and not steady:
             infos["trace"] = np.arange(500_000) + at
-        flags = torch.as_tensor(done) if at % 5 == 2 else done
+        flags = torch.as_tensor(done) if at % 5 == 2 and not steady else done
         return self.seen(), rewards[:-1] if at == 8 else rewards, flags, ~done, infos
 
     def call(self, name, *args):
@@ -446,7 +451,7 @@ def make_env(n_envs=1, use_async_envs=False, mode="NextStep", wide=3, tasks=1):
 def _played(envs: list[Any]) -> list[Any]:
     """What they return and raise in turns, and again once all of it has come."""
     heard: list[Any] = [env.reset(seed=seed) for seed, env in enumerate(envs)]
-    for number, env in itertools.product(range(40), envs):
+    for number, env in itertools.product(range(80), envs):
         try:
             heard.append(env.step(np.full((2, 2), number, np.float32)))
         except (RemoteEnvError, RemoteProtocolError) as error:
@@ -475,6 +480,7 @@ def test_an_own_vector_is_stepped_in_shared_memory_and_returns_the_same(
     Also where several share a process, and where a process that dies is replaced.
     """
     pytest.importorskip("torch")
+    read = Mock(side_effect=StepColumns.read)
     folder = write_repository(tmp_path, _PLAIN)
     options: dict[str, Any] = {"env_kwargs": {"mode": mode, "wide": wide, "tasks": tasks}}
     options |= {"copy": copy, "n_envs": 2}
@@ -486,6 +492,7 @@ def test_an_own_vector_is_stepped_in_shared_memory_and_returns_the_same(
         return relay(self, message, *args)
 
     monkeypatch.setattr(JailHandle, "send_relay", counted)
+    monkeypatch.setattr(StepColumns, "read", lambda *args, **kwargs: read(*args, **kwargs))
     for kind in ("frames", "auto"):
         with make_env(folder, policy={"lane": kind, "restart": restart}, **options) as suites:
             envs = list(suites["suite"].values())
@@ -495,7 +502,8 @@ def test_an_own_vector_is_stepped_in_shared_memory_and_returns_the_same(
             heard[kind] = _played(envs)
             by_server = dict(relayed)
     assert_same(heard["frames"], heard["auto"])
-    assert by_server == {"step": 5 * tasks}  # infos that do not fit
+    assert by_server == {"step": 6 * tasks}  # infos that do not fit
+    assert read.call_count > 10 * tasks
     errors = [text for text in heard["auto"] if isinstance(text, str)]
     assert len(errors) == 4 * tasks
     assert ["no step 5" in errors[0], "rewards" in errors[tasks]] == [True, True]

@@ -20,6 +20,7 @@ import mmap
 import operator
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from time import perf_counter_ns
 from typing import TYPE_CHECKING, Any
@@ -37,9 +38,10 @@ from envhub_sandbox.transport.values import to_tensor, unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.messages.forms import IrregularError
 from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.shared_memory.columns import StepColumns
 from envhub_worker.protocol.shared_memory.packets import (
-    Recurring,
     array_start,
     packet_bytes,
     read_packet,
@@ -121,7 +123,9 @@ class ShardSlabs:
         self._answers = memoryview(reply)[slabs.ANSWER : slabs.ANSWER + slabs.INFO_BYTES]
         self._answer_slots: SlotRing | None = None
         self.told_bytes = self.answer_bytes = 0
-        self._recurring: Recurring | None = None  # the answer to the last step
+        self._step_columns: StepColumns | None = None
+        self._form: StepColumns | None = None  # of the last answer
+        self._checked_form: StepColumns | None = None
         self._actions: Any = None  # the slab as the actions of a step that is a message
         self._told_frames: Frames = []
 
@@ -171,6 +175,7 @@ class ShardSlabs:
         self._told_frames = frames
         length = write_packet(self._request, start, self.layout.request_bytes - start, frames)
         asks[slabs.MESSAGE] = length
+        asks[slabs.WRITTEN] += 1
         self.told_bytes += length
         asks[slabs.TO_SLOT] = 0 if slots is None else 1 + slots.chosen
         self._answer_slots = slots
@@ -252,25 +257,49 @@ class ShardSlabs:
         kind, length = self._tells[slabs.OUTCOME], self._tells[slabs.LENGTH]
         if kind == slabs.FETCH:
             return None
-        slots = self._answer_slots
+        slots, self._form = self._answer_slots, None
         area = self._answers if slots is None else slots.bytes_of_chosen()
+        if kind == slabs.COLUMNS and slots is not None:
+            return self._step_of_columns(length, slots)
         if kind not in (slabs.DONE, slabs.RAISED) or length > len(area):
             raise RemoteProtocolError("the worker wrote an impossible answer into its slab")
         if kind == slabs.RAISED:
             return self.outcome()[1]
         self.answer_bytes += length
-        borrows = slots is not None and slots.chosen != _SPARE
-        known = self._recurring
         with UNTRUSTED:
-            if known is not None and known.length == length:
-                message: m.Message | None = known.message(area, to_tensor, borrows=borrows)
-                if message is not None:
-                    return message
             frames = read_packet(area[:length], limits)
-        message = unpacked(frames, limits=limits, borrows=borrows)
-        found = m.recurring(bytes(frames[0]), limits) if slots is not None else None
-        self._recurring = None if found is None else Recurring(frames, *found)
+        message = unpacked(frames, limits=limits, borrows=_borrows(slots))
+        if slots is not None and type(message) is m.StepDone and self._tells[slabs.OFFERED]:
+            self._derive_columns(message, slots.slot_bytes)
         return message
+
+    def _derive_columns(self, message: m.Message, room: int) -> None:
+        self._asks[slabs.DERIVED] = 0
+        with suppress(IrregularError):
+            self._form = self._step_columns = StepColumns(m.values_of(message), room)
+            self._asks[slabs.DERIVED] = self._asks[slabs.SEQUENCE]
+
+    def _step_of_columns(self, length: int, slots: SlotRing) -> m.Message:
+        columns = self._step_columns
+        if columns is None or length > slabs.INFO_BYTES:
+            raise RemoteProtocolError("the worker wrote an impossible answer into its slab")
+        self._form = columns
+        self.answer_bytes += columns.nbytes + length
+        start = slabs.INFOS
+        with UNTRUSTED:
+            packed = bytes(self._reply[start : start + length])
+            borrows = _borrows(slots)
+            return m.StepDone(*columns.read(slots.memory, packed, to_tensor, borrows=borrows))
+
+    @property
+    def form_is_checked(self) -> bool:
+        """Whether the last answer was a step of a form that ``note_checked`` was said of."""
+        return self._form is not None and self._form is self._checked_form
+
+    def note_checked(self) -> None:
+        """The last answer's classes, dtypes and shapes are as declared."""
+        if self._form is not None:
+            self._checked_form = self._form
 
     def _learn(self, infos: dict[Any, Any]) -> None:
         start = slabs.INFOS
@@ -302,6 +331,10 @@ class ShardSlabs:
         self._tells.release()
         self._answers.release()
         # the maps go with the last array over them
+
+
+def _borrows(slots: SlotRing | None) -> bool:
+    return slots is not None and slots.chosen != _SPARE
 
 
 def _members(known: Any, column: Any) -> Sequence[Any]:
@@ -520,9 +553,14 @@ class SlotRing:
         """The next batch comes another way: the runners leave the slot that may be held."""
         self.chosen = _SPARE
 
-    def bytes_of_chosen(self) -> memoryview:
+    @property
+    def memory(self) -> Any:
         """The memory of the chosen slot, which counts as held while there is a view of it."""
-        return memoryview(self._slots[self.chosen])[: self.slot_bytes]
+        return self._slots[self.chosen]
+
+    def bytes_of_chosen(self) -> memoryview:
+        """The same, as bytes."""
+        return memoryview(self.memory)[: self.slot_bytes]
 
     def close(self) -> None:
         """Give the descriptor back; the memory goes with the last array over it."""

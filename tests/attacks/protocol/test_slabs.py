@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 
+import msgpack
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -275,10 +276,6 @@ def test_the_answer_to_a_step_is_copied_before_it_is_looked_at(
     packet = _packet(*map(bytes, m.pack(m.Value(np.ones(20_000, bool)))))
     assert len(packet) < SLOT
     length = len(packet) if size is None else size
-    for _ in range(4):  # until such an answer is known, and is read without its header
-        os.pwrite(ring.fd, packet, 0)
-        os.pwrite(shard.fds[1], struct.pack("QQ", slabs.DONE, len(packet)), slabs.OUTCOME * 8)
-        assert isinstance(shard.answer(), m.Value)
     attack(
         shard,
         f"os.pwrite(observations, {packet!r}, 0)\n"
@@ -293,5 +290,61 @@ def test_the_answer_to_a_step_is_copied_before_it_is_looked_at(
         attack(shard, f"os.pwrite(observations, bytes({SLOT}), 0)")
         assert isinstance(answer, m.Value)
         assert answer.value.all()
+    shard.close()
+    ring.close()
+
+
+@pytest.mark.parametrize(
+    ("scalars", "refusal"),
+    [
+        (msgpack.packb([0.5, 3, "run"]), ""),
+        (msgpack.packb([0.5, 3]), "other scalars"),
+        (msgpack.packb([0.5, True, "run"]), "other scalars"),
+        (msgpack.packb([0.5, 3, ["run"]]), "other scalars"),
+        (b"\x91" * 5000, "."),
+        (b"\x80\x04.", "."),
+        (b"", "."),
+    ],
+    ids=["control", "few", "bool", "list", "deep", "pickle", "none"],
+)
+def test_columns_of_a_step_are_numbers_and_texts_of_its_form(scalars: bytes, refusal: str) -> None:
+    """Whatever lies in them; booleans are made such, and all of it is copied."""
+    layout = slabs.message_layout(spaces.Box(-1, 1, (2,)), 2)
+    assert layout is not None
+    ring = SlotRing(1, SLOT, SLOT)
+    shard = LaneShard(layout, ring.fd)
+    shard.tell(m.pack(m.Step(1, np.zeros((2, 2)))), (0, 0, 0), ring)
+    columns = struct.pack("QQ", slabs.COLUMNS, len(scalars))
+    attack(shard, f"os.pwrite(reply, {columns!r}, {slabs.OUTCOME * 8})")
+    with pytest.raises(RemoteProtocolError, match="impossible answer"):
+        shard.answer()  # they are of no form yet
+    flags = np.zeros(2, np.bool_)
+    infos = {"log": {"loss": 0.25, "steps": 2}, "name": "walk"}
+    step = m.StepDone(np.zeros(2), np.zeros(2), flags, flags, infos)
+    packet = _packet(*map(bytes, m.pack(step)))
+    os.pwrite(ring.fd, packet, 0)
+    offered = struct.pack("QQQ", slabs.DONE, len(packet), 1)
+    attack(shard, f"os.pwrite(reply, {offered!r}, {slabs.OUTCOME * 8})")
+    assert isinstance(shard.answer(), m.StepDone)
+    attack(
+        shard,
+        f"os.pwrite(observations, b'\x02' * {SLOT}, 0)\n"
+        f"os.pwrite(reply, {scalars!r}, {slabs.INFOS})\n"
+        f"os.pwrite(reply, {columns!r}, {slabs.OUTCOME * 8})",
+    )
+    if refusal:
+        with pytest.raises(RemoteProtocolError, match=refusal):
+            shard.answer()
+    else:
+        answer = shard.answer()
+        attack(shard, f"os.pwrite(observations, bytes({SLOT}), 0)")
+        endless = struct.pack("QQ", slabs.COLUMNS, slabs.INFO_BYTES + 1)
+        attack(shard, f"os.pwrite(reply, {endless!r}, {slabs.OUTCOME * 8})")
+        with pytest.raises(RemoteProtocolError, match="impossible answer"):
+            shard.answer()
+        assert isinstance(answer, m.StepDone)
+        assert answer.info == {"log": {"loss": 0.5, "steps": 3}, "name": "run"}
+        assert answer.terminations.tobytes() == answer.truncations.tobytes() == b"\x01\x01"
+        assert answer.observation.tobytes() == b"\x02" * 16
     shard.close()
     ring.close()

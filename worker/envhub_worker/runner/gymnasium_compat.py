@@ -124,9 +124,9 @@ def _column(env: Any, name: str, values: Any, dtype: Any) -> Any:
             values = np.asarray(values, None if name == "rewards" else dtype)
         except ValueError:
             values = np.empty(0, object)
-    shape, dtype = getattr(values, "shape", None), getattr(values, "dtype", None)
-    if not shape or shape[0] != env.num_envs or getattr(dtype, "kind", "f") == "O":
-        count = env.num_envs
+    shape, count = getattr(values, "shape", None), env.num_envs
+    kind = getattr(getattr(values, "dtype", None), "kind", "f")
+    if not shape or shape[0] != count or kind == "O":
         returned = f"{batches.shown(values)} as {name}"
         raise _misfit(env, "step", f"returns {returned}, which have to be one number each, {count}")
     return values

@@ -19,14 +19,17 @@ import numpy as np
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.messages.forms import IrregularError
 from envhub_worker.protocol.shared_memory import slabs
-from envhub_worker.protocol.shared_memory.packets import read_packet, write_packet
+from envhub_worker.protocol.shared_memory.columns import StepColumns
+from envhub_worker.protocol.shared_memory.packets import array_start, read_packet, write_packet
 from envhub_worker.protocol.spaces import batches
-from envhub_worker.protocol.stream import Packet
 from envhub_worker.runner.prefixes import Watches
 from envhub_worker.runner.sync_envs import Pairs, SubEnvs
 
 _RING = (1).to_bytes(8, "little")
+_SELDOM = 16
+"""Steps, at most, from one offer of columns that were of no use to the next."""
 
 
 class Lane:
@@ -36,7 +39,9 @@ class Lane:
         attach: How many slots there are.
         fds: Request slab, reply slab, observation slab, our doorbell, the client's. Owned from
             now on.
-        answer: Makes the frames of the answer to a message.
+        read: Makes a request of its frames.
+        answer: Makes the frames of the answer to a request; none if the function that it is given
+            says that it has written the answer.
         raised: Makes the message for an exception.
         warned: What the repository has warned of, and no reply has taken along: while there is
             something, answers are fetched by the server, with that in front of them.
@@ -53,14 +58,15 @@ class Lane:
         self,
         attach: m.Attach,
         fds: list[int],
-        answer: Callable[[Packet], list[Any]],
+        read: Callable[[list[Any]], m.Message],
+        answer: Callable[[m.Message, Callable[[m.Message], bool]], list[Any]],
         raised: Callable[[BaseException, str], m.RaisedException],
         warned: Sequence[Any],
         watches: Watches,
     ) -> None:
         self.number = attach.env
         self.unsent: list[Any] = []
-        self._answer = answer
+        self._read, self._answer = read, answer
         self._raised = raised
         self._warned = warned
         self._watches = watches
@@ -80,6 +86,10 @@ class Lane:
         self._told = slabs.words(self._reply)
         self._told[slabs.PARKED] = 1
         self._served = self._changes = self._cpu = self._spin_ns = 0
+        self._step: tuple[int, Any] = 0, None  # ``WRITTEN`` of a step, and its actions in the slab
+        self._columns: tuple[int, StepColumns | None] = 0, None  # and of which step they are
+        self._missed = self._scalars = 0
+        self._offers_at = 1  # misses in a row
 
     def wake(self, *, alone: bool) -> bool:
         """After the doorbell: silence it, and serve; if ``alone``, while requests keep coming
@@ -153,21 +163,62 @@ class Lane:
         return size
 
     def _run_message(self, length: int) -> tuple[int, int]:
-        start = self._message
-        request = read_packet(self._requested[start : start + length], DEFAULT_LIMITS)
-        frames = self.unsent = self._answer(Packet(0, request))
+        self._told[slabs.OFFERED] = 0
+        frames = self.unsent = self._answer(self._request_of(length), self._write_columns)
+        if not frames:
+            return slabs.COLUMNS, self._scalars
         if self._warned or self._changed:
             return slabs.FETCH, 0
-        slot = self._asked[slabs.TO_SLOT]
-        if slot:
-            start, size = (slot - 1) * self._slot_bytes, self._slot_bytes
-            written = write_packet(self._observations, start, size, frames)
+        if self._asked[slabs.TO_SLOT]:
+            written = write_packet(self._observations, self._slot, self._slot_bytes, frames)
         else:
             written = write_packet(self._reply, slabs.ANSWER, slabs.INFO_BYTES, frames)
         if not written:
             return slabs.FETCH, 0
         self.unsent = []
         return slabs.DONE, written
+
+    @property
+    def _slot(self) -> int:
+        return (self._asked[slabs.TO_SLOT] - 1) * self._slot_bytes
+
+    def _request_of(self, length: int) -> m.Message:
+        count, (known, actions) = self._asked[slabs.WRITTEN], self._step
+        if known == count:
+            return m.Step(self.number, actions.copy())
+        start = self._message
+        frames = read_packet(self._requested[start : start + length], DEFAULT_LIMITS)
+        request = self._read(frames)
+        if type(request) is m.Step and type(request.actions) is np.ndarray:
+            array = request.actions
+            start += array_start(frames, array.nbytes)
+            self._step = count, np.ndarray(array.shape, array.dtype, self._request, start)
+        return request
+
+    def _write_columns(self, reply: m.Message) -> bool:
+        """Write a step's results if they have the form of the columns; else offer others, if
+        these were of no use lately: rarely, where no two results are alike.
+        """
+        if type(reply) is not m.StepDone or not self._asked[slabs.TO_SLOT]:
+            return False
+        if (self._watched or self._warned) and self._has_more_to_say():
+            return False
+        derived, columns = self._columns
+        values = m.values_of(reply)
+        if columns is not None and self._asked[slabs.DERIVED] == derived:
+            with contextlib.suppress(IrregularError):
+                packed = columns.write(values, self._observations, self._slot)
+                self._scalars = self._put(packed) if packed else 0
+                self._missed, self._offers_at = 0, 2
+                return True
+        missed = self._missed = self._missed + 1
+        if missed >= self._offers_at:
+            self._offers_at = missed + 1 + min(missed // 8, _SELDOM)
+            with contextlib.suppress(IrregularError):
+                self._columns = self._asked[slabs.SEQUENCE], StepColumns(values, self._slot_bytes)
+                self._told[slabs.OFFERED] = 1
+                self._offers_at = missed + min(missed + 1, _SELDOM)
+        return False
 
     def leave_slot(self) -> None:
         """The next batch is sent as a message: no longer write into the slot, which may be held."""

@@ -133,24 +133,38 @@ class Runner:
         """The reply's frames, with what is to be said of other things in front of them."""
         return self.watches.in_front(self.warned.in_front(self.reply(packet)))
 
-    def reply(self, packet: Packet, *, by_lane: bool = False) -> list[Any]:
+    def reply(self, packet: Packet) -> list[Any]:
         """The reply's frames; whatever the repository raises becomes ``RaisedException``."""
-        try:
-            # the caller's own arguments may be pickled: this is the only place that unpickles
-            request = m.unpack(packet.frames, unpickler=cloudpickle.loads)
-        except Exception as error:  # of a class that is not to be had here, for instance
-            return m.pack(raised(error, "arguments"))
-        self._stage = type(request).__name__.lower()
+        request = self.read(packet.frames)
         lane = self.lanes.get(getattr(request, "env", -1))
-        if lane is not None and not by_lane:
+        if lane is not None:
             if isinstance(request, m.FetchInfos) and lane.unsent:
                 return lane.unsent
             if isinstance(request, (m.Reset, m.Step)):
                 lane.leave_slot()
+        return self._reply_to(request)
+
+    def read(self, frames: list[Any]) -> m.Message:
+        """A request; where it cannot be read, the answer to it."""
+        try:
+            # the caller's own arguments may be pickled: this is the only place that unpickles
+            return m.unpack(frames, unpickler=cloudpickle.loads)
+        except Exception as error:  # of a class that is not to be had here, for instance
+            return raised(error, "arguments")
+
+    def _reply_to(
+        self, request: m.Message, written: Callable[[m.Message], bool] | None = None
+    ) -> list[Any]:
+        """As ``reply``; to the lane's request, which may have ``written`` the reply: then none."""
+        self._stage = type(request).__name__.lower()
         try:
             reply = _HANDLERS[type(request)](self, request)
-            if by_lane and isinstance(reply, m.ResetDone) and lane and lane.has_columns:
-                reply = m.Value(reply.info)  # the observation lies in the slab already
+            if written is not None:
+                if written(reply):
+                    return []
+                lane = self.lanes.get(getattr(request, "env", -1))
+                if isinstance(reply, m.ResetDone) and lane and lane.has_columns:
+                    reply = m.Value(reply.info)  # the observation lies in the slab already
             return (self._pack_infos if type(request) in _WITH_INFOS else self._pack)(reply)
         except ResultError as error:
             return m.pack(raised(error, "return", self._snapshot))
@@ -238,7 +252,8 @@ class Runner:
         env = self._envs[request.env]
         options: tuple[Any, ...] = (
             self.descriptors,
-            partial(self.reply, by_lane=True),
+            self.read,
+            self._reply_to,
             partial(raised, root=self._snapshot),
             self.warned.pending,
             self.watches,
@@ -466,4 +481,5 @@ _HANDLERS: dict[type[m.Message], Callable[[Runner, Any], m.Message]] = {
     m.FetchInfos: Runner.fetch_infos,
     m.FetchInfosApart: Runner.fetch_infos_apart,
     m.TakeApart: Runner.take_apart,
+    m.RaisedException: lambda runner, unreadable: unreadable,
 }

@@ -54,6 +54,7 @@ _CODES = {
     char: _DTYPES.index(np.dtype(char)) for char in "?bBhHiIlLqQefdFD" if np.dtype(char) in _DTYPES
 }
 """By the character of a dtype: "l" and "q" are the same integer on most platforms."""
+NUMBERS = frozenset(_DTYPES)
 
 
 class ArrayWriter:
@@ -349,18 +350,24 @@ _TENSOR_HEADS = {name: msgpack.ExtType(wire.TENSOR, name.encode()) for name in w
 
 
 def _write_tensor(encoder: Encoder, tensor: Any) -> object:
-    """The bits, under torch's name of their dtype."""
+    name, array = tensor_bits(tensor)
+    if array is None:
+        return encoder.unknown(tensor)
+    return [_TENSOR_HEADS[name], encoder.array(array)]
+
+
+def tensor_bits(tensor: Any) -> tuple[str, Array | None]:
+    """Torch's name of a tensor's dtype, and its bits; None where it has no form."""
     name, strided = _tensor_form(tensor.dtype, tensor.layout)
     if not strided or name not in wire.TENSOR_DTYPES:
-        return encoder.unknown(tensor)
+        return name, None
     try:
-        array = tensor.numpy()
+        return name, tensor.numpy()
     except (RuntimeError, TypeError):  # it has a gradient, lies elsewhere, or is a view of a kind
         plain = tensor.detach().cpu().resolve_conj().resolve_neg()
         if name == "bfloat16":
             plain = plain.view(sys.modules["torch"].int16)
-        array = plain.numpy().view(wire.TENSOR_DTYPES[name])
-    return [_TENSOR_HEADS[name], encoder.array(array)]
+        return name, plain.numpy().view(wire.TENSOR_DTYPES[name])
 
 
 @lru_cache(maxsize=64)

@@ -203,13 +203,6 @@ def unpack(
         return message
 
 
-def recurring(header: bytes, limits: WireLimits) -> tuple[int, Incoming] | None:
-    """How many bytes of an unpacked header are its document, and its form, if it has one."""
-    end = DOCUMENT_BYTES.size + DOCUMENT_BYTES.unpack_from(header)[0]
-    form = _INCOMING.get(header[:end])
-    return None if form is None or form.limits is not limits else (end, form)
-
-
 def _alone(frames: Sequence[Buffer]) -> bytes:
     """The header, where that is all there is and small: what recurs; else nothing."""
     if len(frames) != 1:

@@ -9,13 +9,11 @@ import struct
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import accumulate
-from operator import add
 from typing import Any
 
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits
-from envhub_worker.protocol.messages.forms import Incoming
 from envhub_worker.protocol.shared_memory.words import LINE
 from envhub_worker.protocol.stream import check_lengths
 
@@ -38,34 +36,6 @@ def _starts(lengths: tuple[int, ...]) -> tuple[int, ...]:
 
 def _lengths(frames: Sequence[Buffer]) -> tuple[int, ...]:
     return tuple([memoryview(frame).nbytes for frame in frames])
-
-
-class Recurring:
-    """A packet whose next one differs in the bytes of its arrays alone, and what to make of it.
-
-    Trust: input from a peer. What it is told apart by was checked, and is compared as a copy.
-    """
-
-    __slots__ = ("_buffers", "_form", "_header", "_tail", "_words", "length")
-
-    def __init__(self, frames: Sequence[Buffer], document_bytes: int, form: Incoming) -> None:
-        lengths = _lengths(frames)
-        start, *starts = _starts(lengths)
-        end = start + document_bytes
-        self._words = struct.pack(f"<{1 + len(lengths)}Q", len(lengths), *lengths)
-        self._header = start, end, bytes(frames[0][:document_bytes])
-        self._tail = slice(end, start + lengths[0])
-        self._buffers = list(map(slice, starts, map(add, starts, lengths[1:])))
-        self._form = form
-        self.length = _starts(lengths)[-1]
-
-    def message(self, memory: memoryview, tensors: Any, *, borrows: bool) -> Any:
-        """The message that lies there; None if it is not of that form."""
-        words, (start, end, document) = self._words, self._header
-        if bytes(memory[: len(words)]) != words or bytes(memory[start:end]) != document:
-            return None
-        buffers = [memory[part] for part in self._buffers]
-        return self._form.message(memory[self._tail], buffers, tensors, borrows=borrows)
 
 
 def packet_bytes(frames: Sequence[Buffer]) -> int:

@@ -21,7 +21,10 @@ PARKED = 8
 OUTCOME = 16
 """Reply: ``DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``."""
 LENGTH = 17
-"""Reply: bytes of the encoded infos, or of what was raised; 0 for an empty info."""
+"""Reply: bytes of the encoded infos, or of what was raised; 0 for an empty info. Where a step is a
+message: of the answer, or of its scalars if it is columns."""
+OFFERED = 18
+"""Reply: 1 if the client should derive columns from the answer to this step."""
 SPIN = 16
 """Request: nanoseconds that the shard may wait for the next request without sleeping."""
 SLOT = 17
@@ -38,7 +41,12 @@ takes the steps: so much it sends of infos that came as columns."""
 TO_SLOT = 22
 """Request: one more than the slot of the observation slab that the answer to a message is written
 into; 0 for the reply slab."""
-DTYPES = 24
+DERIVED = 23
+"""Request: the ``SEQUENCE`` of the step whose answer the client has derived columns from, or 0."""
+WRITTEN = 24
+"""Request: grows with every message. If it is the same, the message is, too, but for the bytes of
+the array of actions in it."""
+DTYPES = 32
 """Request: the dtype code of each action leaf, one word each, up to ``MAX_LEAVES``."""
 MAX_LEAVES = 64
 HEADER_WORDS = DTYPES + MAX_LEAVES
@@ -46,7 +54,8 @@ HEADER_BYTES = HEADER_WORDS * 8
 
 DONE, RAISED, FETCH, COLUMNS = 1, 2, 3, 4
 """Results and encoded infos are in the slab; an encoded ``RaisedException`` is; the infos must be
-fetched; the infos are columns (see ``slabs``)."""
+fetched; the infos are columns (see ``slabs``), or all results of a step that is a message are (see
+``columns``)."""
 
 INFOS = HEADER_BYTES
 """Offset of the encoded infos in a reply slab."""

@@ -1,0 +1,221 @@
+"""A step's results as columns, where a step is a message: only what differs, without a codec.
+
+Most steps return the same classes, keys, shapes and dtypes as the last. Both sides derive the
+columns from one message that went encoded; while results have that form, their numbers and texts
+alone are written. No offset, class or key comes from the jail in between.
+
+Arrays, and bits of tensors, have a place each in the slot of the observation slab. Scalars are a
+list in msgpack, in the reply slab's area of infos.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any
+
+import msgpack  # type: ignore[import-untyped]
+import numpy as np
+
+from envhub_worker.protocol.codec import arrays
+from envhub_worker.protocol.codec.decoder import TensorMaker
+from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.messages.forms import IrregularError
+from envhub_worker.protocol.shared_memory.words import INFO_BYTES, LINE
+
+_MAX_LEAVES = 1024
+_PLAIN = frozenset({float, int, bool, str})
+New = tuple[list[Any], list[Any]]
+"""Scalars and arrays of new results, in the order of the columns."""
+_Take = Callable[[Any, New], None]
+"""Adds the scalars and arrays of a part; raises ``IrregularError``: it has another form."""
+_Make = Callable[[Iterator[Any], Iterator[Any]], Any]
+
+
+class StepColumns:
+    """The columns of results like these.
+
+    Args:
+        values: The fields of one message.
+        room: Bytes of a slot.
+
+    Attributes:
+        nbytes: What the arrays take in a slot.
+
+    Raises:
+        IrregularError: They are more than numbers, texts, arrays of numbers, tensors, None and
+            bytes, in tuples, lists and dicts by text; or too many, or too large.
+    """
+
+    def __init__(self, values: Sequence[Any], room: int) -> None:
+        self._scalars: list[type] = []
+        self._arrays: list[tuple[tuple[int, ...], np.dtype[Any], int, str]] = []
+        self.nbytes, self._room = 0, room
+        self._copies: tuple[Any, list[Callable[[], Any]]] = None, []
+        self._views: dict[int, list[Any]] = {}
+        try:
+            self._fields = [self._part(value) for value in values]
+        except RecursionError as error:
+            raise IrregularError from error
+        named = enumerate(name for _, _, _, name in self._arrays)
+        self._tensors = [(index, name) for index, name in named if name]
+
+    # --- what they are -------------------------------------------------------------------------
+
+    def _part(self, value: Any) -> tuple[_Take, _Make]:
+        kind = type(value)
+        if kind in _PLAIN:
+            return self._scalar(kind, kind, item=False)
+        if value is None or kind is bytes:
+            return partial(_take_same, value), lambda scalars, found: value
+        if kind is dict and not set(map(type, value)) - {str}:
+            return self._members(kind, value.values(), list(value))
+        if kind is tuple or kind is list:
+            return self._members(kind, value, len(value))
+        return self._leaf(value)
+
+    def _members(self, kind: Any, items: Any, keys: Any) -> tuple[_Take, _Make]:
+        parts = [self._part(item) for item in items]
+        takes, makes = [take for take, _ in parts], [make for _, make in parts]
+
+        def take(value: Any, new: New) -> None:
+            if type(value) is not kind or (list(value) if kind is dict else len(value)) != keys:
+                raise IrregularError
+            for part, item in zip(takes, value.values() if kind is dict else value, strict=True):
+                part(item, new)
+
+        def make(scalars: Iterator[Any], found: Iterator[Any]) -> Any:
+            made = [part(scalars, found) for part in makes]
+            if kind is dict:
+                return dict(zip(keys, made, strict=True))
+            return made if kind is list else tuple(made)
+
+        return take, make
+
+    def _scalar(self, kind: Any, plain: type, item: bool) -> tuple[_Take, _Make]:
+        self._scalars.append(plain)
+        if plain not in _PLAIN:  # complex
+            raise IrregularError
+        self._refuse_too_many()
+
+        def take(value: Any, new: New) -> None:
+            if type(value) is not kind:
+                raise IrregularError
+            new[0].append(value.item() if item else value)
+
+        if item:
+            return take, lambda scalars, found: kind(next(scalars))
+        return take, lambda scalars, found: next(scalars)
+
+    def _leaf(self, value: Any) -> tuple[_Take, _Make]:
+        name, array = "", value
+        if isinstance(value, np.generic) and value.dtype in arrays.NUMBERS:
+            return self._scalar(type(value), type(value.item()), item=True)
+        if type(value) is _tensor_type():
+            name, array = arrays.tensor_bits(value)
+        # without torch bfloat16 arrives as another dtype
+        if type(array) is not np.ndarray or array.dtype not in arrays.NUMBERS or name == "bfloat16":
+            raise IrregularError
+        self._arrays.append((array.shape, array.dtype, self.nbytes, name))
+        self.nbytes += -(-array.nbytes // LINE) * LINE
+        self._refuse_too_many()
+        take = partial(_take_tensor if name else _take_array, array.dtype, array.shape)
+        return take, lambda scalars, found: next(found)
+
+    def _refuse_too_many(self) -> None:
+        if self.nbytes > self._room or len(self._scalars) + len(self._arrays) > _MAX_LEAVES:
+            raise IrregularError
+
+    # --- out and in ----------------------------------------------------------------------------
+
+    def write(self, values: Sequence[Any], memory: Any, start: int) -> bytes:
+        """Write arrays into the slot at ``start``; returns the scalars, packed.
+        Raises ``IrregularError``: these results have another form; nothing was written.
+        """
+        new: New = [], []
+        for (take, _), value in zip(self._fields, values, strict=True):
+            take(value, new)
+        packed = _packed(new[0]) if new[0] else b""
+        views = self._views.get(start)
+        if views is None:
+            places = [(shape, dtype, start + at) for shape, dtype, at, _ in self._arrays]
+            views = self._views[start] = [
+                np.ndarray(shape, dtype, memory, offset) for shape, dtype, offset in places
+            ]
+        for view, array in zip(views, new[1], strict=True):
+            view[...] = array
+        return packed
+
+    def read(
+        self, memory: Any, packed: bytes, tensors: TensorMaker, *, borrows: bool = False
+    ) -> list[Any]:
+        """The fields of the message; fresh, but for large arrays if it ``borrows``.
+        ``memory``: the slot. Trust: input from the worker.
+        """
+        scalars = self._read_scalars(packed) if self._scalars or packed else ()
+        if borrows:
+            found = [_borrowed(memory, *place) for place in self._arrays]
+        else:
+            if self._copies[0] is not memory:
+                self._copies = memory, [_copier(memory, *place) for place in self._arrays]
+            found = [copy() for copy in self._copies[1]]
+        for index, name in self._tensors:
+            found[index] = tensors(found[index], name)
+        each = iter(scalars), iter(found)
+        return [make(*each) for _, make in self._fields]
+
+    def _read_scalars(self, packed: bytes) -> list[Any]:
+        scalars = msgpack.unpackb(packed, strict_map_key=False)
+        if type(scalars) is not list or list(map(type, scalars)) != self._scalars:
+            raise RemoteProtocolError("the worker wrote other scalars than it had announced")
+        return scalars
+
+
+def _packed(scalars: list[Any]) -> bytes:
+    try:
+        packed: bytes = msgpack.packb(scalars)
+    except (OverflowError, UnicodeEncodeError) as error:
+        raise IrregularError from error
+    if len(packed) > INFO_BYTES:
+        raise IrregularError
+    return packed
+
+
+def _take_same(known: Any, value: Any, new: New) -> None:
+    if type(value) is not type(known) or value != known:
+        raise IrregularError
+
+
+def _take_array(dtype: np.dtype[Any], shape: tuple[int, ...], value: Any, new: New) -> None:
+    if type(value) is not np.ndarray or value.shape != shape or value.dtype != dtype:
+        raise IrregularError
+    new[1].append(value)
+
+
+def _take_tensor(dtype: np.dtype[Any], shape: tuple[int, ...], value: Any, new: New) -> None:
+    if type(value) is not _tensor_type():
+        raise IrregularError
+    name, array = arrays.tensor_bits(value)
+    if name == "bfloat16":
+        raise IrregularError
+    _take_array(dtype, shape, array, new)
+
+
+def _tensor_type() -> Any:
+    return getattr(sys.modules.get("torch"), "Tensor", None)
+
+
+def _copier(memory: Any, shape: Any, dtype: Any, at: int, _: str) -> Callable[[], Any]:
+    if dtype.kind == "b":  # a hostile byte of 2 would make a boolean that is neither
+        return partial(np.ndarray(shape, np.uint8, memory, at).astype, np.bool_)
+    array: arrays.Array = np.ndarray(shape, dtype, memory, at)
+    return array.copy
+
+
+def _borrowed(memory: Any, shape: Any, dtype: np.dtype[Any], at: int, name: str) -> Any:
+    large = dtype.kind != "b" and dtype.itemsize * math.prod(shape) > arrays.INLINE_BYTES
+    if large:
+        return np.ndarray(shape, dtype, memory, at)
+    return _copier(memory, shape, dtype, at, name)()
