@@ -7,6 +7,7 @@ import shutil
 import signal
 import threading
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -21,9 +22,9 @@ from envhub_sandbox.cli.shared.exits import Exit
 from envhub_sandbox.errors import SnapshotError, remote_error
 from envhub_sandbox.extras.judge.checks import Severity
 from envhub_sandbox.extras.judge.command import check as command
+from envhub_sandbox.extras.judge.command import list_run
 from envhub_sandbox.extras.judge.command.check import SETTINGS
 from envhub_sandbox.extras.judge.command.deadline import DeadlineReached, deadline_alarm
-from envhub_sandbox.extras.judge.command.list_run import ListRun
 from envhub_sandbox.extras.judge.findings import Report
 from envhub_sandbox.extras.judge.references import ListEntry
 from envhub_sandbox.extras.sources.checkout import make_checkout
@@ -121,8 +122,8 @@ def test_what_cannot_be_is_told_first(arguments: str, says: str, judged: Judged)
 PASSES, FAILS, LATE, ABSENT, PIPE = "passes", "fails", "late", "absent", "pipe"
 
 
-def run_of(outcomes: Sequence[str], text: str = "it broke") -> ListRun:
-    """A list whose repositories end like this, and say so in a stranger's words."""
+def results_of(outcomes: Sequence[str], text: str = "it broke") -> list[list_run.Result]:
+    """Of a list whose repositories end like this, and say so in a stranger's words."""
 
     def judge(reference: str) -> Report:
         report, outcome = Report(text), reference.partition("/")[2]
@@ -137,13 +138,10 @@ def run_of(outcomes: Sequence[str], text: str = "it broke") -> ListRun:
         report.judged("runs", [text] if outcome == FAILS else [], text)
         return report
 
-    run = ListRun(
-        file="-", judge=judge, least=Severity.ERROR, allowed=(), settings=None, policy=None
-    )
-    for number, outcome in enumerate(outcomes, 1):
-        name = f"{number}/{outcome}"
-        run.results.append(run.judged(ListEntry(name, name, number)))
-    return run
+    names = [f"{number}/{outcome}" for number, outcome in enumerate(outcomes)]
+    entries = [ListEntry(name, name, number) for number, name in enumerate(names)]
+    failures = partial(Report.failures, fail_on=Severity.ERROR)
+    return [list_run.judge_entry(entry, judge, failures) for entry in entries]
 
 
 @pytest.mark.parametrize(
@@ -158,9 +156,9 @@ def run_of(outcomes: Sequence[str], text: str = "it broke") -> ListRun:
     ],
 )
 def test_the_worst_counts(outcomes: list[str], code: Exit) -> None:
-    assert run_of(outcomes).exit is code
+    assert list_run.exit_code(results_of(outcomes)) is code
     with pytest.raises(BrokenPipeError):  # the control: of what is printed
-        run_of([*outcomes, "no reader"])
+        results_of([*outcomes, "no reader"])
 
 
 @pytest.mark.parametrize("text", HOSTILE)
@@ -168,12 +166,12 @@ def test_a_strangers_words_are_text_in_every_form(
     text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(tmp_path / "summary"))
-    run = run_of([FAILS, ABSENT], text)
-    run.write(tmp_path / "junit")
+    results = results_of([FAILS, ABSENT], text)
+    list_run.write_junit(tmp_path / "junit", results)
     suites = ElementTree.parse(tmp_path / "junit").getroot()
     assert (suites.attrib["failures"], suites.attrib["errors"]) == ("1", "1")
     with guarded(), pytest.raises(typer.Exit):
-        run.show(json=False, github=True)
+        list_run.show_results(results, json=False, github=True)
     lines = capsys.readouterr().out.splitlines()
     assert [line.partition(" ")[0] for line in lines] == ["::error", "::error"]
     table = (tmp_path / "summary").read_text().splitlines()

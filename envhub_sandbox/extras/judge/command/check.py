@@ -170,6 +170,7 @@ def check(
     if not math.isfinite(deadline):
         raise UsageError(f"--deadline is {deadline}; it takes seconds, such as 900")
     least, allowed = level(str(fail_on)), _known(allow or ())
+    files = {"--settings": settings, "--policy": policy}
     from envhub_sandbox.extras.judge.settings import no_report_but_ours, refuse_files_of_the_judged
 
     def judged(reference: str) -> Report:
@@ -186,31 +187,26 @@ def check(
             pictures=html is not None,
         )
 
+    def failing(report: Report) -> list[Finding]:
+        return report.failures(least, allowed)
+
     if listed is not None:
         _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
         _arguments(make, policy)  # what cannot be is said before anything is judged
-        from envhub_sandbox.extras.judge.command.list_run import ListRun
+        from envhub_sandbox.extras.judge.command import list_run
 
-        run = ListRun(
-            file=listed,
-            judge=judged,
-            least=least,
-            allowed=allowed,
-            settings=settings,
-            policy=policy,
-            debug=debug,
-        )
         with no_report_but_ours([junit], "./"):
-            run.run()
-            run.write(junit)
-        run.show(json=json, github=github)
+            results = list_run.judge_list(listed, judged, failing, files, debug=debug)
+            if junit is not None:
+                list_run.write_junit(junit, results)
+        list_run.show_results(results, json=json, github=github)
         return
     if ref is None:
         raise UsageError("name a repository, or a list of them: --all FILE")
-    refuse_files_of_the_judged({"--settings": settings, "--policy": policy}, ref)
+    refuse_files_of_the_judged(files, ref)
     with no_report_but_ours((junit, sarif, html), ref):
         report = judged(ref)
-        failures = report.failures(least, allowed)
+        failures = failing(report)
         _write(report, failures, junit, sarif, html)
     from envhub_sandbox.extras.judge import reports
 
