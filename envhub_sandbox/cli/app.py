@@ -151,7 +151,7 @@ class Command(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Call the function."""
-        known = {name for one in self.params for name in one.opts}
+        known = {name for parameter in self.params for name in parameter.opts}
         with use_option_names(on_command_line(known)):
             return super().invoke(ctx)
 

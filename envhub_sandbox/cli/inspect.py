@@ -135,6 +135,6 @@ def _check_options(context: typer.Context, *, static: bool, download: bool) -> N
     else:
         means = set(context.params) - _OF_STATIC - {"upgrade"}
         why = "it needs --static or --download"
-    for one in context.command.params:
-        if one.name not in means and opt.is_typed(context, one.name or ""):
-            raise UsageError(f"{one.opts[0]} means nothing here: {why}")
+    for parameter in context.command.params:
+        if parameter.name not in means and opt.is_typed(context, parameter.name or ""):
+            raise UsageError(f"{parameter.opts[0]} means nothing here: {why}")

@@ -93,7 +93,7 @@ def _containers() -> tuple[list[Leftover], dict[str, str]]:
         except (SandboxUnavailableError, EngineError) as error:
             if shutil.which(name) and not is_elsewhere(name):
                 unasked[name] = str(error)
-    return [one for some in found.values() for one in some], unasked
+    return [leftover for leftovers in found.values() for leftover in leftovers], unasked
 
 
 def stale_containers(engine: Engine) -> Iterator[Leftover]:

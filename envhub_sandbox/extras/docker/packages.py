@@ -78,7 +78,7 @@ class ImageTarget:
         """Whether the image has all of it; raises as ``image_packages``."""
         interpreter, there = self._inside()
         names = set(map(canonicalize_name, there))
-        known = all(one.is_among(names) for one in request.guesses)
+        known = all(guess.is_among(names) for guess in request.guesses)
         return known and first_unmet(request, there, interpreter.version) is None
 
     def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
@@ -252,7 +252,7 @@ def derived(
     if is_new:
         tell(f"building the image {tag}")
         build(engine, dockerfile(base, lock, system), lock, tag, network)
-    return DerivedImage(tag, is_new, lock, tuple(one.module for one in guesses))
+    return DerivedImage(tag, is_new, lock, tuple(guess.module for guess in guesses))
 
 
 def _check_python(request: PackageRequest, target: Target) -> None:
@@ -277,7 +277,7 @@ class BuiltImageTarget(ImageTarget):
         engine = self._engine()
         made = derived(engine, self._image, request, network=self._network, tell=tell)
         facts = {"lock": f"sha256:{made.lock.digest}", "packages": made.lock.packages}
-        inferred = [one.facts for one in request.guesses if one.module in made.taken]
+        inferred = [guess.facts for guess in request.guesses if guess.module in made.taken]
         return PackageSet(made.tag, facts | ({"inferred": inferred} if inferred else {}))
 
 

@@ -175,7 +175,7 @@ class EngineRun:
             if not self._announced:
                 *lines, line = (line + data).split(b"\n")
                 line = line[-_LINE_BYTES:]
-                self._announced += [one for one in lines if one.startswith(b'{"envhub-worker"')]
+                self._announced += [text for text in lines if text.startswith(b'{"envhub-worker"')]
 
     def endpoint(self) -> str:
         """Where its port is published. Raises ``SandboxUnavailableError``: it is not."""

@@ -54,7 +54,7 @@ class Fleet(Sandbox):
             raise PolicyError(
                 f"a fleet's places are {self.places!r}; they are a list, or text with commas"
             )
-        known = {one.name for one in fields(RemoteSandbox) if one.init} - {"endpoint"}
+        known = {option.name for option in fields(RemoteSandbox) if option.init} - {"endpoint"}
         if unknown := sorted(map(repr, set(self.remote) - known)):
             raise PolicyError(
                 f"a fleet's remote has {', '.join(unknown)}; RemoteSandbox takes "

@@ -140,7 +140,7 @@ class FleetPackages:
         each = {address: made.facts for address, made in sets.items()}
         first = next(iter(each.values()))
         facts: dict[str, Any] = first
-        if any(one != first for one in each.values()):
+        if any(kind != first for kind in each.values()):
             facts = {**first, "places": each}
         if here is None:
             return PackageSet("", facts)

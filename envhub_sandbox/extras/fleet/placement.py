@@ -62,16 +62,18 @@ class Rooms:
 
     def ask(self, members: Iterable[Member]) -> dict[Member, Room]:
         """The room of each, asked of all at the same time; of one that is not a server its own."""
-        sandboxes = {one: one.sandbox for one in members}
-        servers = {m: one for m, one in sandboxes.items() if isinstance(one, RemoteSandbox)}
+        sandboxes = {member: member.sandbox for member in members}
+        servers = {
+            m: sandbox for m, sandbox in sandboxes.items() if isinstance(sandbox, RemoteSandbox)
+        }
         with self._asking:  # who comes next finds the answers
             now = monotonic()
-            stale = [one for one in servers if self._is_stale(one, now)]
-            calls = [partial(remote.ask_facts, servers[one]) for one in stale]
+            stale = [server for server in servers if self._is_stale(server, now)]
+            calls = [partial(remote.ask_facts, servers[server]) for server in stale]
             asked = Calls(calls)
             asked.wait(_WAIT_S)
             self._pending.update({one: (now, p) for one, p in zip(stale, asked.each, strict=True)})
-            return {one: self._room(one) for one in servers}
+            return {server: self._room(server) for server in servers}
 
     def _is_stale(self, member: Member, now: float) -> bool:
         at, pending = self._pending.get(member, (0.0, None))
@@ -140,7 +142,9 @@ class Placement:
                 members: list[Member] = []
                 for key, count in Counter(map(_key, self._places)).items():
                     each = self._resolve(named[key]).workers(count)
-                    members += [Member(one, self._runtime, count // len(each)) for one in each]
+                    members += [
+                        Member(sandbox, self._runtime, count // len(each)) for sandbox in each
+                    ]
                 self._members = members
             return list(self._members)
 
@@ -158,7 +162,9 @@ class Placement:
         with self._lock:
             if self._repository is None:
                 members = self.members()
-                for member in [one for one in members if not one.absent] or members:
+                for member in [
+                    candidate for candidate in members if not candidate.absent
+                ] or members:
                     member.open_for(repository)
                 self._rooms = Rooms(memory_bytes)
                 self._repository = repository
@@ -168,7 +174,7 @@ class Placement:
         with self._lock:  # each of a thousand workers asks, and there may be a thousand places
             members = self._open_ones()
             if self._run_by is None or self._run_by[0] != members:
-                self._run_by = members, _all_together(one.runs_on(runtime) for one in members)
+                self._run_by = members, _all_together(member.runs_on(runtime) for member in members)
             return self._run_by[1]
 
     def retry_s(self) -> float:
@@ -219,7 +225,7 @@ class Placement:
     def _open_ones(self) -> list[Member]:
         """Those that are made for the repository; before that all."""
         members = self._members or self.members()
-        opened = [one for one in members if one.is_open]
+        opened = [member for member in members if member.is_open]
         return opened or members
 
     def _opens(self, number: int, member: Member) -> bool:
@@ -254,11 +260,11 @@ class Placement:
 
 def _all_together(each: Iterable[Runtime]) -> Runtime:
     """One that stands for all: that of places that are alike, or else a name of them together."""
-    runtimes = sorted(set(each), key=lambda one: (one.python, one.packages))
+    runtimes = sorted(set(each), key=lambda runtime: (runtime.python, runtime.packages))
     if len(runtimes) == 1:
         return runtimes[0]
     # it is looked up as a path, which thousands of addresses are too long for
-    digest = hashlib.sha256(repr([tuple(one) for one in runtimes]).encode())
+    digest = hashlib.sha256(repr([tuple(runtime) for runtime in runtimes]).encode())
     return Runtime(f"fleet/of/{digest.hexdigest()}")
 
 

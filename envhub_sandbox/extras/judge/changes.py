@@ -75,7 +75,7 @@ def _rank(change: Change) -> int:
 
 
 def _records(read: Static) -> dict[str, FileRecord]:
-    return {one.record.path: one.record for one in read.files}
+    return {file.record.path: file.record for file in read.files}
 
 
 def _other(then: Static, now: Static) -> set[str]:
@@ -86,7 +86,7 @@ def _other(then: Static, now: Static) -> set[str]:
 
 def _files(then: Static, now: Static, other: Collection[str]) -> Iterator[Change]:
     before, after = _records(then), _records(now)
-    gone = {path: one.digest for path, one in before.items() if path not in after}
+    gone = {path: record.digest for path, record in before.items() if path not in after}
     was = {digest: path for path, digest in gone.items()}
     moved = {was.get(one.digest) for path, one in after.items() if path not in before}
     for path in sorted({*before, *after}):
@@ -158,8 +158,8 @@ def _value(what: str, then: str, now: str) -> Iterator[Change]:
 
 def _packages(read: Static) -> dict[str, str]:
     found: dict[str, list[str]] = {}
-    for one in read.declared.wanted if read.declared else ():
-        found.setdefault(one.requirement.name.lower(), []).append(str(one))
+    for package in read.declared.wanted if read.declared else ():
+        found.setdefault(package.requirement.name.lower(), []).append(str(package))
     return {name: ", ".join(sorted(texts)) for name, texts in found.items()}
 
 
@@ -182,8 +182,8 @@ def _findings(then: Static, now: Static, other: Collection[str]) -> Iterator[Cha
     for how, mine, others in (("new", after, before), ("gone", before, after)):
         known = Counter({key: len(found) for key, found in others.items()})
         for key, found in mine.items():
-            for one in found[known[key] :]:
-                yield Change("finding", how, one.text, one)
+            for finding in found[known[key] :]:
+                yield Change("finding", how, finding.text, finding)
 
 
 def _by_line(read: Static, other: Collection[str]) -> dict[tuple[str, ...], list[Finding]]:
@@ -197,15 +197,15 @@ def _by_line(read: Static, other: Collection[str]) -> dict[tuple[str, ...], list
     digests: dict[str, list[str]] = {}
     for path in other:
         digests.setdefault(printable(path, _LONGEST), []).append(records[path].digest)
-    for one in read.findings:
-        text = sorted(digests.get(one.file, ()))
-        if one.line and one.file in records:
-            if one.file not in lines:
-                data = bytes_of(read.snapshot.root / one.file, _MOST_BYTES)
+    for finding in read.findings:
+        text = sorted(digests.get(finding.file, ()))
+        if finding.line and finding.file in records:
+            if finding.file not in lines:
+                data = bytes_of(read.snapshot.root / finding.file, _MOST_BYTES)
                 split = re.split("\r\n|\r|\n", data.decode("utf-8", "replace"))
-                lines[one.file] = [line.strip() for line in split]
-            text = lines[one.file][one.line - 1 : one.line]
-        found.setdefault((one.id, one.file, one.message, *text), []).append(one)
+                lines[finding.file] = [line.strip() for line in split]
+            text = lines[finding.file][finding.line - 1 : finding.line]
+        found.setdefault((finding.id, finding.file, finding.message, *text), []).append(finding)
     return found
 
 
@@ -223,12 +223,12 @@ def document(then: Static, now: Static, found: list[Change]) -> dict[str, Any]:
         "same": not found,
         "changes": [
             {
-                "what": one.what,
-                "change": one.how,
-                "text": one.text,
-                "finding": one.finding and one.finding.document(),
-                "lines": list(one.lines),
+                "what": change.what,
+                "change": change.how,
+                "text": change.text,
+                "finding": change.finding and change.finding.document(),
+                "lines": list(change.lines),
             }
-            for one in found
+            for change in found
         ],
     }

@@ -229,16 +229,18 @@ def long_lines(file: str, text: str) -> Iterator[Finding]:
 
 
 def _imported(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
-    for one in parsed.imports:
-        for name in dict.fromkeys(module.partition(".")[0] for module in _absolute(one)):
+    for statement in parsed.imports:
+        for name in dict.fromkeys(module.partition(".")[0] for module in _absolute(statement)):
             public = _bare(name) if name in sys.stdlib_module_names else name  # of _socket: socket
             if check := _MODULES.get(public):
-                yield one.line, check, f"imports {name}"
+                yield statement.line, check, f"imports {name}"
 
 
-def _absolute(one: ImportStatement) -> Sequence[str]:
+def _absolute(statement: ImportStatement) -> Sequence[str]:
     # below 0: names of modules; 0: names out of one; above: relative
-    return one.names if one.level < 0 else () if one.level else (one.module,)
+    return (
+        statement.names if statement.level < 0 else () if statement.level else (statement.module,)
+    )
 
 
 def _bare(name: str) -> str:
@@ -247,7 +249,9 @@ def _bare(name: str) -> str:
 
 
 def _used(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
-    imported = {name.partition(".")[0] for one in parsed.imports for name in _absolute(one)}
+    imported = {
+        name.partition(".")[0] for statement in parsed.imports for name in _absolute(statement)
+    }
     through = imported - _MODULES.keys()
     for name, line in parsed.uses:
         parts = name.split(".")

@@ -148,17 +148,17 @@ class Report:
             task=printable(finding.task, 200),
             file=printable(finding.file, 500),
         )
-        insort(self.findings, kept, key=lambda one: one.check.severity.rank)
+        insort(self.findings, kept, key=lambda finding: finding.check.severity.rank)
         return kept
 
     def failures(self, fail_on: Severity, allowed: Collection[str] = ()) -> list[Finding]:
         """The findings that weigh enough, without those that are allowed."""
-        found = (one for one in self.findings if one.id not in allowed)
-        return [one for one in found if one.check.severity.reaches(fail_on)]
+        found = (finding for finding in self.findings if finding.id not in allowed)
+        return [finding for finding in found if finding.check.severity.reaches(fail_on)]
 
     def stopped(self, seconds: float, at: str) -> None:
         """A deadline of so many seconds ended it at something: what was not judged is a finding."""
-        made = {one.id for one in self.findings} | {check for check, _ in self.passed}
+        made = {finding.id for finding in self.findings} | {check for check, _ in self.passed}
         self.unmade = [check for check in CHECKS if check not in made and check != "deadline"]
         left = [*self.unmade, *(f"all of {task}" for task in self.waiting)]
         more = [f"and {len(left) - _SHOWN} more"] if len(left) > _SHOWN else []
@@ -169,11 +169,11 @@ class Report:
     @staticmethod
     def is_unjudged(failures: Collection[Finding]) -> bool:
         """Whether nothing fails but that there was no time to judge all of it."""
-        return bool(failures) and all(one.id == "deadline" for one in failures)
+        return bool(failures) and all(finding.id == "deadline" for finding in failures)
 
     def verdict(self, failures: Collection[Finding]) -> str:
         """What came of it, in a sentence."""
-        held = counted(len({one for one, _ in self.passed}), "check holds", "checks hold")
+        held = counted(len({check for check, _ in self.passed}), "check holds", "checks hold")
         found = counted(len(self.findings) + self.left_out, "finding")
         if not failures:
             return f"{held}, {found}: passed"

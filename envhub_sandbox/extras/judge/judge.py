@@ -139,7 +139,7 @@ class _Judge:
         found = survey(self._snapshot, self._files).findings
         for finding in found:
             self._report.add(finding)
-        wrong = {one.id for one in found}
+        wrong = {finding.id for finding in found}
         for check in CHECKS:
             if check.startswith(("licence", "card", "source-")) and check not in wrong:
                 self._report.judged(check, [])
@@ -151,13 +151,13 @@ class _Judge:
             choice, _ = chosen(self._asked.arguments.get("dependencies", "auto"), None)
             says = declared(self._snapshot.root, self._snapshot.path)
             stated = () if says is None else says.wanted
-            wanted = {one.requirement.name: one.requirement for one in stated}
+            wanted = {package.requirement.name: package.requirement for package in stated}
             if self._asked.arguments.get("python") is None and self._is_here:
                 made = packages_for(self._snapshot, choice)
                 if made is not None:
                     packages = Path(made.packages)
                     inferred = made.facts.get("inferred", ())
-                    taken = {one["module"]: one["where"] for one in inferred}
+                    taken = {guess["module"]: guess["where"] for guess in inferred}
         except DependencyError as error:
             if error.reason not in ("requirement", "resolution", "integrity"):
                 raise
@@ -226,7 +226,7 @@ class _Judge:
         dated = self._with_older_packages(error)
         if not isinstance(error, DependencyError):  # also a name that a terminal would obey
             self._report.raised("loads", error, message=f"{error}{dated}")
-        elif dated or all(one.id != "imports" for one in self._report.findings):  # else it was said
+        elif dated or "imports" not in {finding.id for finding in self._report.findings}:
             self._report.raised("imports", error, message=f"{error}{dated}")
 
     def _with_older_packages(self, error: EnvHubError) -> str:

@@ -62,13 +62,13 @@ def _findings(report: Report, failures: Collection[Finding]) -> Iterator[str]:
     if not report.findings:
         return
     yield '<h2>Findings</h2>\n<ul class="findings">'
-    for one in report.findings:
-        severity = one.check.severity.value
-        mark = f"{severity}, fails it" if one in failures else severity
-        where = f' <span class="dim">{text(one.task)}</span>' if one.task else ""
+    for finding in report.findings:
+        severity = finding.check.severity.value
+        mark = f"{severity}, fails it" if finding in failures else severity
+        where = f' <span class="dim">{text(finding.task)}</span>' if finding.task else ""
         badge = f'<span class="badge">{mark}</span>'
-        yield f'<li class="{severity}">{badge} <code>{one.id}</code>{where}'
-        yield f'<p>{text(one.text)}</p><span class="cure">{text(one.cure)}</span></li>'
+        yield f'<li class="{severity}">{badge} <code>{finding.id}</code>{where}'
+        yield f'<p>{text(finding.text)}</p><span class="cure">{text(finding.cure)}</span></li>'
     yield "</ul>"
 
 
@@ -204,9 +204,9 @@ def _ran(provenance: Mapping[str, Any]) -> Iterator[str]:
     says = [(f"{name}, as it says", value) for name, value in interpreter]
     yield from facts([*((name, provenance.get(name)) for name in _RAN), *says])
     listed = provenance.get("layers") or ()
-    held = sum(one.get("enforced") is True for one in listed)
+    held = sum(row.get("enforced") is True for row in listed)
     layers = [
-        tuple(text(one.get(name)) for name in ("layer", "enforced", "detail")) for one in listed
+        tuple(text(row.get(name)) for name in ("layer", "enforced", "detail")) for row in listed
     ]
     yield from folded(
         f"layers that confined it ({held} of {len(layers)})",

@@ -29,8 +29,13 @@ def document(report: Report, failures: Sequence[Finding]) -> dict[str, Any]:
         "commit": report.commit,
         "passed": not failures,
         "findings": [
-            {**one.document(), "cure": one.cure, "task": one.task or None, "fails": one in failures}
-            for one in report.findings
+            {
+                **finding.document(),
+                "cure": finding.cure,
+                "task": finding.task or None,
+                "fails": finding in failures,
+            }
+            for finding in report.findings
         ],
         "left_out": report.left_out,
         "unjudged": {"checks": report.unmade, "tasks": report.waiting},
@@ -54,9 +59,14 @@ def xml(root: ElementTree.Element) -> str:
 
 def suite(report: Report, failures: Sequence[Finding]) -> ElementTree.Element:
     """A report as one of JUnit's suites."""
-    asked = dict.fromkeys([*((one.id, one.task) for one in report.findings), *report.passed])
-    failed = dict.fromkeys((one.id, one.task) for one in failures)
-    unjudged = [*((check, "") for check in report.unmade), *(("*", one) for one in report.waiting)]
+    asked = dict.fromkeys(
+        [*((finding.id, finding.task) for finding in report.findings), *report.passed]
+    )
+    failed = dict.fromkeys((finding.id, finding.task) for finding in failures)
+    unjudged = [
+        *((check, "") for check in report.unmade),
+        *(("*", task) for task in report.waiting),
+    ]
     made = ElementTree.Element(
         "testsuite",
         name=xml_text(report.reference),
@@ -67,8 +77,10 @@ def suite(report: Report, failures: Sequence[Finding]) -> ElementTree.Element:
     )
     for check, task in asked:
         case = _case(made, check, task)
-        found = [one for one in report.findings if (one.id, one.task) == (check, task)]
-        text = "\n".join(one.text for one in found)
+        found = [
+            finding for finding in report.findings if (finding.id, finding.task) == (check, task)
+        ]
+        text = "\n".join(finding.text for finding in found)
         if (check, task) in failed:
             words = xml_text(CHECKS[check].sentence)
             ElementTree.SubElement(case, "failure", message=words).text = xml_text(text)
@@ -102,24 +114,26 @@ def sarif(report: Report, failures: Sequence[Finding]) -> str:
     ]
     run = {
         "tool": {"driver": {"name": "envhub check", "rules": rules}},
-        "results": [_result(one, failures, report.folder) for one in report.findings],
+        "results": [_result(finding, failures, report.folder) for finding in report.findings],
         "invocations": [{"executionSuccessful": not (report.unmade or report.waiting)}],
         "columnKind": "unicodeCodePoints",
     }
     return json.dumps({"$schema": _SCHEMA, "version": "2.1.0", "runs": [run]}, indent=2) + "\n"
 
 
-def _result(one: Finding, failures: Sequence[Finding], folder: str) -> dict[str, Any]:
-    where = f"{one.task}: " if one.task else ""
-    place: dict[str, Any] = {"artifactLocation": {"uri": quote(folder + (one.file or "env.py"))}}
-    if one.line:
-        place["region"] = {"startLine": one.line}
+def _result(finding: Finding, failures: Sequence[Finding], folder: str) -> dict[str, Any]:
+    where = f"{finding.task}: " if finding.task else ""
+    place: dict[str, Any] = {
+        "artifactLocation": {"uri": quote(folder + (finding.file or "env.py"))}
+    }
+    if finding.line:
+        place["region"] = {"startLine": finding.line}
     return {
-        "ruleId": one.id,
-        "level": one.check.severity.value,
-        "message": {"text": _sarif_text(f"{where}{one.message}")},
+        "ruleId": finding.id,
+        "level": finding.check.severity.value,
+        "message": {"text": _sarif_text(f"{where}{finding.message}")},
         "locations": [{"physicalLocation": place}],
-        "properties": {"fails": one in failures},
+        "properties": {"fails": finding in failures},
     }
 
 
@@ -131,12 +145,12 @@ def _sarif_text(text: str) -> str:
 
 def workflow_commands(report: Report) -> Iterator[str]:
     """GitHub's workflow commands, one a line: a stranger's text cannot begin another."""
-    for one in report.findings:
-        place = f"file={_property(report.folder + one.file)}," if one.file else ""
-        place += f"line={one.line}," if one.line else ""
-        title = f"envhub check: {one.id}" + (f" ({one.task})" if one.task else "")
-        text = f"{one.message}\n{one.cure}"
-        yield workflow_command(_GITHUB[one.check.severity], title, text, place)
+    for finding in report.findings:
+        place = f"file={_property(report.folder + finding.file)}," if finding.file else ""
+        place += f"line={finding.line}," if finding.line else ""
+        title = f"envhub check: {finding.id}" + (f" ({finding.task})" if finding.task else "")
+        text = f"{finding.message}\n{finding.cure}"
+        yield workflow_command(_GITHUB[finding.check.severity], title, text, place)
     if report.confinement is not None and report.confinement.is_partial:
         words = "\n".join(report.confinement.lines())
         yield workflow_command("notice", "envhub check: confinement", words)
@@ -162,9 +176,9 @@ def summary(report: Report, failures: Collection[Finding]) -> str:
         lines += [*(f"- {cell(line)}" for line in report.confinement.lines()), ""]
     if report.findings:
         lines += ["| | check | task | finding |", "| --- | --- | --- | --- |"]
-    for one in report.findings:
-        mark = "**fails**" if one in failures else one.check.severity.value
-        lines.append(f"| {mark} | {one.id} | {cell(one.task)} | {cell(one.text)} |")
+    for finding in report.findings:
+        mark = "**fails**" if finding in failures else finding.check.severity.value
+        lines.append(f"| {mark} | {finding.id} | {cell(finding.task)} | {cell(finding.text)} |")
     return "\n".join(lines) + "\n"
 
 

@@ -131,7 +131,7 @@ def folder_below_here(reference: str) -> str:
 def _named_in(path: Path, folder: str) -> Path | None:
     """Where a path below a folder leads, if none of the links in there is followed."""
     whole = Path(os.path.abspath(path))
-    tops = [one for one in whole.parents if os.path.realpath(one) == folder]
+    tops = [parent for parent in whole.parents if os.path.realpath(parent) == folder]
     return Path(folder, whole.relative_to(tops[-1])) if tops else None
 
 

@@ -63,10 +63,10 @@ class Survey:
 
     def add(self, found: Iterable[Finding]) -> None:
         """Take what was found in one place, as far as there is room."""
-        for one in found:
-            self._kept[one.id] += 1
-            if len(self.findings) < _MOST or self._kept[one.id] <= _OF_EACH:
-                self.findings.append(one)
+        for finding in found:
+            self._kept[finding.id] += 1
+            if len(self.findings) < _MOST or self._kept[finding.id] <= _OF_EACH:
+                self.findings.append(finding)
 
 
 def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Survey:
@@ -77,14 +77,14 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Surve
     found.add(_in_place(snapshot))
     found.add(_in_front(snapshot))
     left, unread = _MOST_BYTES_IN_ALL, 0
-    for record in sorted(snapshot.files, key=lambda one: one.path):
+    for record in sorted(snapshot.files, key=lambda record: record.path):
         path = snapshot.root / record.path
         ending = bytes_of(path, contents.ENDING, max(record.size - contents.ENDING, 0))
         kind = contents.kind_of_contents(record.path, bytes_of(path, contents.BEGINNING), ending)
         found.files.append(File(record, kind))
         found.add(contents.of_kind(record.path, kind, is_folder=snapshot.is_local))
-        for one in contents.hidden(record.path, record.path, is_code=True):
-            found.add([Finding(one.id, f"its name {one.message}", file=record.path)])
+        for finding in contents.hidden(record.path, record.path, is_code=True):
+            found.add([Finding(finding.id, f"its name {finding.message}", file=record.path)])
         if record.path in parsed:
             found.add(_in_code(record, parsed[record.path]))
         if parsed.get(record.path) is not None:
@@ -194,12 +194,12 @@ def _uncommitted(checkout: Checkout, snapshot: Snapshot) -> Iterator[Finding]:
 
 def _left_out(here: LocalFolder) -> Iterator[Finding]:
     left: dict[str, list[str]] = {}
-    for one in here.left_out():
-        if one.why == REPOSITORY:
+    for item in here.left_out():
+        if item.why == REPOSITORY:
             message = "a git repository of its own: the commit around it has none of its files"
-            yield Finding("source-uncommitted", message, file=one.path)
+            yield Finding("source-uncommitted", message, file=item.path)
         else:
-            left.setdefault(one.why, []).append(one.path)
+            left.setdefault(item.why, []).append(item.path)
     for why, paths in left.items():
         more = len(paths) - _SHOWN_IGNORED
         shown = ", ".join([*paths[:_SHOWN_IGNORED], *([f"{more} more"] if more > 0 else [])])
@@ -278,15 +278,18 @@ class Static:
     @property
     def modules(self) -> dict[str, Import]:
         """Each module that is imported, with the first place."""
-        return {one.name: one for one in reversed(self.imports)}
+        return {statement.name: statement for statement in reversed(self.imports)}
 
     def is_brought(self, module: str) -> bool:
         """Whether a package of a module's name is declared, or in every sandbox.
 
         Some packages have another name than their modules.
         """
-        wanted = [one.requirement for one in self.declared.wanted] if self.declared else []
-        names = {canonicalize_name(one.name) for one in [*wanted, *map(Requirement, WORKERS)]}
+        wanted = [package.requirement for package in self.declared.wanted] if self.declared else []
+        names = {
+            canonicalize_name(requirement.name)
+            for requirement in [*wanted, *map(Requirement, WORKERS)]
+        }
         return canonicalize_name(module) in names
 
 
@@ -306,13 +309,13 @@ def static(snapshot: Snapshot) -> Static:
         entries=() if entry is None else entry.entries,
         imports=imports(snapshot, parsed),
         declared=says,
-        findings=sorted(map(_printable, findings), key=lambda one: one.check.severity.rank),
+        findings=sorted(map(_printable, findings), key=lambda finding: finding.check.severity.rank),
     )
 
 
-def _printable(one: Finding) -> Finding:
-    file, message = printable(one.file, _LONGEST), printable(one.message, _LONGEST)
-    return replace(one, file=file, message=message)
+def _printable(finding: Finding) -> Finding:
+    file, message = printable(finding.file, _LONGEST), printable(finding.message, _LONGEST)
+    return replace(finding, file=file, message=message)
 
 
 def document(read: Static) -> dict[str, Any]:
@@ -326,12 +329,12 @@ def document(read: Static) -> dict[str, Any]:
         },
         "files": [
             {
-                "path": one.record.path,
-                "bytes": one.record.size,
-                "hash": one.record.digest,
-                "kind": one.kind,
+                "path": file.record.path,
+                "bytes": file.record.size,
+                "hash": file.record.digest,
+                "kind": file.kind,
             }
-            for one in read.files
+            for file in read.files
         ],
         "declared": says
         and {"source": says.source, "python": says.python, "packages": list(map(str, says.wanted))},
@@ -339,7 +342,7 @@ def document(read: Static) -> dict[str, Any]:
             {"name": one.name, "file": one.file, "line": one.line, "brought": read.is_brought(name)}
             for name, one in sorted(read.modules.items())
         ],
-        "findings": [one.document() for one in read.findings],
+        "findings": [finding.document() for finding in read.findings],
     }
 
 
@@ -359,9 +362,13 @@ def undeclared(
     brought = _of_this_interpreter({} if packages else stated)
     if packages:
         brought |= {path.name.partition(".")[0] for path in packages.iterdir()}
-    missing = [one for one in found if one.name not in brought or one.name in taken]
-    named = {one.name for one in missing}
-    found_at = [(f"{one.name} is imported", one.file, one.line) for one in missing]
+    missing = [
+        statement for statement in found if statement.name not in brought or statement.name in taken
+    ]
+    named = {statement.name for statement in missing}
+    found_at = [
+        (f"{statement.name} is imported", statement.file, statement.line) for statement in missing
+    ]
     found_at += [(where, "", 0) for module, where in taken.items() if module not in named]
     return [
         Finding("imports", f"{what}, and nothing declares it", "", file, line)
@@ -371,7 +378,9 @@ def undeclared(
 
 def _of_this_interpreter(declared: Mapping[str, Requirement]) -> set[str]:
     wanted = [*map(Requirement, WORKERS), *declared.values()]
-    return {module for one in interpreters.brought(wanted) for module in _modules(one)}
+    return {
+        module for distribution in interpreters.brought(wanted) for module in _modules(distribution)
+    }
 
 
 def _modules(found: metadata.Distribution) -> set[str]:

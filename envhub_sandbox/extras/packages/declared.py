@@ -111,7 +111,7 @@ class WantedPackage:
     hashes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        return " ".join([str(self.requirement), *(f"--hash={one}" for one in self.hashes)])
+        return " ".join([str(self.requirement), *(f"--hash={digest}" for digest in self.hashes)])
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def optional(root: Path) -> dict[str, WantedPackage]:
         found = [wanted for row in extras.values() for wanted in _list(row, where)]
     except DependencyError:
         return {}
-    return {canonicalize_name(one.requirement.name): one for one in found}
+    return {canonicalize_name(package.requirement.name): package for package in found}
 
 
 def not_read(root: Path, entry: str) -> list[str]:
@@ -181,7 +181,7 @@ def parse_requirement(text: str, where: str) -> WantedPackage:
     plain, *hashes = map(str.strip, re.split(r"(?<=\s)(?=--hash[= ])", text))
     if len(plain) > MAX_LINE:
         raise _unsupported(f"{where} has {len(plain)} characters; at most {MAX_LINE} are read")
-    found = [_HASH.fullmatch(one.strip()) for one in hashes]
+    found = [_HASH.fullmatch(digest.strip()) for digest in hashes]
     try:
         requirement = Requirement(plain)
         if not all(found):
@@ -199,7 +199,7 @@ def parse_requirement(text: str, where: str) -> WantedPackage:
             f"{where} takes {requirement.name} from {requirement.url[:200]!r}; only packages of "
             f"the index are installed. {_advice()}"
         )
-    return WantedPackage(requirement, where, tuple(one[1] for one in found if one))
+    return WantedPackage(requirement, where, tuple(match[1] for match in found if match))
 
 
 def _is_literal(text: str) -> bool:
@@ -208,11 +208,11 @@ def _is_literal(text: str) -> bool:
     Texts in markers are read with Python's escapes: one could end its line or its quotes, and what
     comes then would be a line of its own, which uv obeys.
     """
-    texts = [one[1:-1] for one in _QUOTED.findall(text.partition(";")[2])]
+    texts = [quoted[1:-1] for quoted in _QUOTED.findall(text.partition(";")[2])]
     return (
         "\\" not in text
         and text.replace("\t", " ").isprintable()
-        and not any("'" in one or '"' in one for one in texts)
+        and not any("'" in text or '"' in text for text in texts)
     )
 
 

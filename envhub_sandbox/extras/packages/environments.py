@@ -142,7 +142,10 @@ def provide(lock: Lock, interpreter: Interpreter, tell: Tell = lambda line: None
 def every() -> list[Environment]:
     """All of them, the latest used first."""
     found = [_read(record.parent) for record in root().glob(f"[!.]*/{RECORD}")]
-    return sorted((one for one in found if one is not None), key=lambda one: -one.used)
+    return sorted(
+        (environment for environment in found if environment is not None),
+        key=lambda environment: -environment.used,
+    )
 
 
 def remove(environment: Environment) -> str:

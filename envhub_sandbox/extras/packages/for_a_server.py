@@ -139,7 +139,7 @@ def _request(order: Mapping[str, Any]) -> PackageRequest:
         ),
         constraints=_wanted(order["constraints"]),
         override=_wanted(order["override"]),
-        without=tuple(one.requirement.name for one in _wanted(left_out)),
+        without=tuple(package.requirement.name for package in _wanted(left_out)),
         gpu=order["gpu"],
     )
 
@@ -260,7 +260,7 @@ def _make_room(order: Mapping[str, Any]) -> None:
     if _charged(folder) > order["bytes"] // 2:
         remove_tree(_uv_cache(order))
         remove_tree(folder / "resolutions")
-    removable = [one for one in reversed(environments.every()) if one.key not in keep]
+    removable = [kept for kept in reversed(environments.every()) if kept.key not in keep]
     for environment in removable:
         if _charged(folder) <= order["bytes"] // 2:
             return

@@ -117,7 +117,7 @@ def find(asked: str, declared: str = "", *, fetch: bool = False) -> Interpreter:
 def others(declared: str, first: Interpreter) -> list[Interpreter]:
     """The other releases on this machine that a repository may run in, the newest first."""
     found = _others(SpecifierSet(declared) & _OLDEST)
-    return [one for one in found if one.series != first.series]
+    return [version for version in found if version.series != first.series]
 
 
 def _fetch(wanted: SpecifierSet) -> None:
@@ -198,10 +198,12 @@ def first_unmet(
     found = version or release(platform.python_version())
     if not python.contains(found, prereleases=True):
         return f"python{request.supports}"
-    hashed = next((one for one in request.wanted if one.hashes or one.requirement.url), None)
+    hashed = next(
+        (package for package in request.wanted if package.hashes or package.requirement.url), None
+    )
     if hashed is not None:
         return str(hashed.requirement)
-    reached = _reached((one.requirement for one in request.wanted), there, found)
+    reached = _reached((package.requirement for package in request.wanted), there, found)
     for wanted, met_by in reached:
         if met_by is None or not _is_among(met_by, wanted.specifier):
             return str(wanted)
@@ -210,7 +212,11 @@ def first_unmet(
 
 def brought(requirements: Iterable[Requirement]) -> list[metadata.Distribution]:
     """What this interpreter has of these, whichever version, and of all that they lead to."""
-    return [one for _, one in _reached(requirements) if isinstance(one, metadata.Distribution)]
+    return [
+        distribution
+        for _, distribution in _reached(requirements)
+        if isinstance(distribution, metadata.Distribution)
+    ]
 
 
 def _reached(
@@ -228,7 +234,7 @@ def _reached(
         environment |= {"python_full_version": version, "python_version": minor}
     here = cache(_distribution)
     met: set[tuple[str, frozenset[str]]] = set()
-    waiting = [(one, frozenset[str]()) for one in requirements]
+    waiting = [(requirement, frozenset[str]()) for requirement in requirements]
     while waiting:
         wanted, extras = waiting.pop()
         try:
@@ -242,13 +248,13 @@ def _reached(
         yield wanted, found
         if found is not None and key not in met:
             met.add(key)
-            waiting += [(one, key[1]) for one in _needs(found)]
+            waiting += [(requirement, key[1]) for requirement in _needs(found)]
 
 
 def _applies(wanted: Requirement, extras: frozenset[str], environment: dict[str, str]) -> bool:
     marker = wanted.marker
     each = ({**environment, "extra": extra} for extra in extras or ("",))
-    return marker is None or any(marker.evaluate(one) for one in each)
+    return marker is None or any(marker.evaluate(variables) for variables in each)
 
 
 def _distribution(name: str) -> metadata.Distribution | None:

@@ -130,7 +130,10 @@ def _of_module(name: str, extras: Mapping[str, WantedPackage]) -> tuple[str, str
 
     distributions = of_module(name)
     names = list(map(str, map(canonicalize_name, distributions or [name.partition(".")[0]])))
-    own = next((str(extras[one].requirement) for one in names if one in extras), None)
+    own = next(
+        (str(extras[distribution].requirement) for distribution in names if distribution in extras),
+        None,
+    )
     if own is None and not distributions:
         return None
     return name.partition(".")[0], own or distributions[0], names
@@ -218,7 +221,10 @@ def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     from envhub_sandbox.extras.sources import parsing
 
     files = parsing.read(snapshot)
-    found = [(one.module, one.file, one.line) for one in parsing.imports(snapshot, files)]
+    found = [
+        (statement.module, statement.file, statement.line)
+        for statement in parsing.imports(snapshot, files)
+    ]
     found = [row for row in found if row[0].partition(".")[0] not in _WORKERS]
     rows = [*found, *(row for row in parsing.ids(snapshot, files) if _of_id(row[0]))]
     keep(*place, json.dumps(rows))
@@ -293,8 +299,12 @@ class MissingModule:
             return f"{here}: it ran in an environment of its own; {host} runs it in this one"
         python = self.python or sys.executable
         folders = Path(path).absolute().parents
-        project = next((one for one in folders if (one / "pyproject.toml").is_file()), None)
-        project = project or next((one for one in folders if (one / "setup.py").is_file()), None)
+        project = next(
+            (parent for parent in folders if (parent / "pyproject.toml").is_file()), None
+        )
+        project = project or next(
+            (parent for parent in folders if (parent / "setup.py").is_file()), None
+        )
         editable = "" if _built_on_import(module) else "-e "
         if project is not None:
             words = f"{python} -m pip install {editable}{project}"

@@ -93,7 +93,7 @@ class ThisMachine:
         if found.lock.has_cuda and not request.gpu:
             _warn_of_cuda(found.lock, found.interpreter)
         made = PackageSet.of(environments.provide(found.lock, found.interpreter, tell))
-        inferred = [one.facts for one in request.guesses if one.module in found.taken]
+        inferred = [guess.facts for guess in request.guesses if guess.module in found.taken]
         return replace(made, facts=made.facts | {"inferred": inferred}) if inferred else made
 
 
@@ -107,7 +107,9 @@ def _warn_of_cuda(lock: Lock, interpreter: Interpreter) -> None:
     size = 0
     with contextlib.suppress(DependencyError, LockError):  # the installation will say what is wrong
         found = pylock.listed(lock.packages, interpreter.path, lock.options)
-        size = sum(max((wheel.size or 0 for wheel in one.wheels), default=0) for one in found)
+        size = sum(
+            max((wheel.size or 0 for wheel in package.wheels), default=0) for package in found
+        )
     much = f" ({size_text(size)} of downloads)" if size else ""
     warnings.warn(
         f"PyTorch comes with CUDA{much}, and jails have no GPU here: the index has no build "
@@ -191,7 +193,7 @@ def locked_packages(snapshot: Snapshot, lock: LockFile) -> PackageSet:
         here = replace(here, runner=lockfile.Runner.of(interpreter))
         making.refuse(making.differences(lock, here), snapshot.label)
         with log.progress_shown("packages") as tell:
-            locked = [one.origin for one in lock.packages if one.origin is not None]
+            locked = [package.origin for package in lock.packages if package.origin is not None]
             pins = _with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)
             made = environments.provide(pins, interpreter, tell)
             return PackageSet.of(made)
@@ -213,7 +215,7 @@ def _with_wheels(
 
     if not locked or environments.ready(environments.key_of(lock, interpreter)) is not None:
         return lock
-    wheels = build([one.source for one in locked], interpreter, tell)
+    wheels = build([origin.source for origin in locked], interpreter, tell)
     text, options = lock.text, list(lock.options)
     for origin, wheel in zip(locked, wheels, strict=True):
         built = describe(wheel)

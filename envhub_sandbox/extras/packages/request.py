@@ -137,12 +137,12 @@ def _names(given: Mapping[str, Any]) -> tuple[str, ...]:
     from packaging.utils import canonicalize_name
 
     found = _requirements(given, "without")
-    for one in found:
-        if str(one.requirement) != one.requirement.name:
+    for package in found:
+        if str(package.requirement) != package.requirement.name:
             raise PolicyError(
-                f"without in dependencies has {str(one)!r}; it takes names of packages"
+                f"without in dependencies has {str(package)!r}; it takes names of packages"
             )
-    return tuple(canonicalize_name(one.requirement.name) for one in found)
+    return tuple(canonicalize_name(package.requirement.name) for package in found)
 
 
 def _python(given: object) -> str:
@@ -248,10 +248,10 @@ def _refuse_misspelt(
     """
     from packaging.utils import canonicalize_name
 
-    known = {str(canonicalize_name(one.requirement.name)) for one in wanted}
-    known |= {name for one in guesses for name in one.brought_by}
+    known = {str(canonicalize_name(package.requirement.name)) for package in wanted}
+    known |= {name for guess in guesses for name in guess.brought_by}
     for name in set(without) - known:
-        others = sorted(one for one in known if not name.startswith(one))
+        others = sorted(other for other in known if not name.startswith(other))
         if near := nearest(name, others, _ALIKE):
             raise PolicyError(f"without in dependencies has {name!r}{near}, which nothing declares")
 
@@ -262,7 +262,7 @@ def _guesses(snapshot: Snapshot, choice: Choice) -> tuple[Guess, ...]:
     from envhub_sandbox.extras.packages.modules import guessed
 
     left_out = set(choice.without)
-    return tuple(one for one in guessed(snapshot) if left_out.isdisjoint(one.brought_by))
+    return tuple(guess for guess in guessed(snapshot) if left_out.isdisjoint(guess.brought_by))
 
 
 def may_declare(root: Path, entry: str) -> bool:

@@ -57,7 +57,7 @@ class WorkerActor:
     def _started(self, client_key: str) -> dict[str, Any]:
         import ray
 
-        gpus = [int(one) for one in ray.get_gpu_ids()]
+        gpus = [int(index) for index in ray.get_gpu_ids()]
         node = ray.get_runtime_context().get_node_id()
         address = ray.util.get_node_ip_address()
         host = f"[{address}]" if ":" in address else address

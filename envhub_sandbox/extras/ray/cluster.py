@@ -219,8 +219,12 @@ def _one_line(text: str) -> str:
 def _busy(within_s: float) -> ServerBusyError:
     import ray
 
-    free = {one: round(count, 2) for one, count in ray.available_resources().items()}
-    shown = {one: free[one] for one in sorted(free) if not one.startswith(("node:", "object_"))}
+    free = {resource: round(count, 2) for resource, count in ray.available_resources().items()}
+    shown = {
+        resource: free[resource]
+        for resource in sorted(free)
+        if not resource.startswith(("node:", "object_"))
+    }
     return ServerBusyError(
         f"Ray has started no worker server within {within_s:g} s, and {shown} are free in the "
         f"whole cluster. Close environments, ask for less in RaySandbox(num_cpus=..., "

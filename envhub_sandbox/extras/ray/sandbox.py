@@ -96,7 +96,7 @@ class RaySandbox(Sandbox):
 
     def __reduce__(self) -> Any:
         """Without the servers, which are this process's."""
-        given = {one.name: getattr(self, one.name) for one in fields(self) if one.init}
+        given = {option.name: getattr(self, option.name) for option in fields(self) if option.init}
         return _made, (given,)
 
     def for_repository(
@@ -249,7 +249,7 @@ def read_started(said: Mapping[str, Any]) -> tuple[str, bytes, str, tuple[int, .
     Trust: input from a node. Raises ``WorkerStartupError``: it says something else.
     """
     try:
-        endpoint, key, node, gpus = (said[one] for one in ("endpoint", "key", "node", "gpus"))
+        endpoint, key, node, gpus = (said[name] for name in ("endpoint", "key", "node", "gpus"))
         parts = urlsplit(endpoint)
         ipaddress.ip_address(parts.hostname or "")
         good = parts.scheme == "tcp" and endpoint == f"tcp://{parts.netloc}" and parts.port

@@ -196,8 +196,8 @@ def order_of(request: PackageRequest) -> m.NeedPackages:
         request.exclude_newer or "",
         request.always,
         guesses=tuple(
-            (str(one.wanted), one.wanted.where, one.module, " ".join(one.brought_by))
-            for one in request.guesses
+            (str(guess.wanted), guess.wanted.where, guess.module, " ".join(guess.brought_by))
+            for guess in request.guesses
         ),
         constraints=_rows(request.constraints),
         override=_rows(request.override),
@@ -207,7 +207,7 @@ def order_of(request: PackageRequest) -> m.NeedPackages:
 
 
 def _rows(wanted: Sequence[WantedPackage]) -> tuple[tuple[str, str], ...]:
-    return tuple((str(one), one.where) for one in wanted)
+    return tuple((str(package), package.where) for package in wanted)
 
 
 def request_packages(

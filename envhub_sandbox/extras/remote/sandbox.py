@@ -328,7 +328,7 @@ class ServerFacts:
     def enforces(self, profile: str) -> bool:
         """Whether a jail can have a profile there, and may."""
         known = (self.profile, profile, self.weakest_profile)
-        if not all(one in PROFILES for one in known):
+        if not all(profile in PROFILES for profile in known):
             return False
         strongest, asked, weakest = map(PROFILES.index, known)
         return strongest <= asked <= weakest

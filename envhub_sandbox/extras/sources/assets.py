@@ -105,10 +105,10 @@ def with_assets(
     with progress_shown("assets") as tell:
         hub = dict(hub) if given else {**hub, "public": True}
         found = [_fetched(ref, where, tell, hub) for ref in wanted]
-        theirs = {(one.repo_type, one.repo_id.casefold()) for one in found}
+        theirs = {(asset.repo_type, asset.repo_id.casefold()) for asset in found}
         left = DEFAULT_LIMITS.max_bytes
         for ref in declared:
-            if any(_may_be(ref, *one) for one in theirs):
+            if any(_may_be(ref, *their) for their in theirs):
                 continue
             limits = replace(DEFAULT_LIMITS, max_bytes=max(1, left))
             taken = _fetched(ref, f"its {CARD}", tell, {**hub, "public": True}, limits)

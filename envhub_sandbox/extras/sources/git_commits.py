@@ -250,7 +250,7 @@ class _Git:
             what = "a git repository has to be downloaded, and git is not installed"
             raise HubFailure(Kind.OTHER, what, "Install it, as in 'apt-get install git'")
         settings = [*_SETTINGS, *(f"protocol.{name}.allow=always" for name in address.PROTOCOLS)]
-        command = [program, *(word for one in settings for word in ("-c", one)), *arguments]
+        command = [program, *(word for setting in settings for word in ("-c", setting)), *arguments]
         store = self._store
         with tempfile.TemporaryFile(dir=store) as said, tempfile.TemporaryFile(dir=store) as kept:
             try:

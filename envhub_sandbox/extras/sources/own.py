@@ -38,7 +38,10 @@ def own_files(root: Path, entry: str, names: Names) -> set[str]:
                 left -= len(data)
         read = _read(texts)
         waiting = {
-            path for file, one in read.items() if one for path in _imported(file, one, names)
+            path
+            for file, parsed_file in read.items()
+            if parsed_file
+            for path in _imported(file, parsed_file, names)
         }
         waiting -= files
         if not waiting or None in read.values():  # what took too much once is not tried on and on

@@ -250,8 +250,8 @@ class _Meanings:
                 _add(self._imported.setdefault(first, []), [first])
 
     def _assign(self, target: ast.AST, meanings: list[str]) -> bool:
-        known = [one for one in meanings if re.split(r"[.:]", one)[0] in self._roots]
-        known = [one for one in known if not one.endswith("()")]
+        known = [meaning for meaning in meanings if re.split(r"[.:]", meaning)[0] in self._roots]
+        known = [meaning for meaning in known if not meaning.endswith("()")]
         name = _bound_by(target) or getattr(target, "attr", "")
         return bool(known and name) and _add(self._assigned.setdefault(name, []), known)
 
@@ -409,7 +409,7 @@ def _unpacked(target: ast.expr, value: ast.expr) -> Iterator[tuple[ast.AST, ast.
 
 def _arguments(called: list[str], node: ast.Call) -> Iterator[str]:
     """What makes a call load pickles: an argument, or the lack of one."""
-    arguments = {one.arg: one.value for one in node.keywords}
+    arguments = {keyword.arg: keyword.value for keyword in node.keywords}
     if isinstance(several := arguments.pop(None, None), ast.Dict):
         keys = [_constant([key]) if key else "" for key in several.keys]
         arguments |= zip(keys, several.values, strict=True)

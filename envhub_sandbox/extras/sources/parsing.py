@@ -162,7 +162,7 @@ def _answer(row: Any) -> ParsedFile | None:
         return ParsedFile(is_python=bool(row), **row)
     whole = row.pop("is_whole")
     found: dict[str, Any] = {kind: tuple(map(tuple, rows)) for kind, rows in row.items()}
-    found["imports"] = tuple(ImportStatement(*one) for one in row["imports"])
+    found["imports"] = tuple(ImportStatement(*statement) for statement in row["imports"])
     return ParsedFile(is_whole=whole, **found)
 
 

@@ -183,7 +183,7 @@ def check(
             steps=steps,
             resets=resets,
             slow_step_s=slow_step,
-            tasks=lambda envs: [one[:2] for one in opt.select_envs(envs, suite, task)],
+            tasks=lambda envs: [row[:2] for row in opt.select_envs(envs, suite, task)],
             pictures=html is not None,
         )
 
@@ -305,8 +305,8 @@ def _print_confinement(report: Report) -> None:
 
 def _print(report: Report, failures: list[Finding]) -> None:
     out(safe_line(report.reference, 300), "bold")
-    for one in report.findings:
-        show_finding(one, fails=one in failures)
+    for finding in report.findings:
+        show_finding(finding, fails=finding in failures)
     if report.figures:
         out()
         show_rows([_FIGURES, *map(_figures, report.figures.items())], right=range(1, 5))

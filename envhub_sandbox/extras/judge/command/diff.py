@@ -64,9 +64,9 @@ def diff(
         if run:
             kwargs = make["env_kwargs"]
             tasks = []
-            for one in read:
-                bar.begin(f"loading {one.reference} in a sandbox")
-                tasks.append(_tasks(one.snapshot, kwargs, make.source))
+            for repository in read:
+                bar.begin(f"loading {repository.reference} in a sandbox")
+                tasks.append(_tasks(repository.snapshot, kwargs, make.source))
             found += changes.environments(tasks[0], tasks[1])
     if json:
         print_json(changes.document(read[0], read[1], found))
@@ -74,7 +74,7 @@ def diff(
         _print(read[0].reference, read[1].reference, found)
     if least is None and found:
         raise typer.Exit(Exit.DIFFERENT)
-    if least and any(one.weighs(least) for one in found):
+    if least and any(change.weighs(least) for change in found):
         raise typer.Exit(Exit.ENVIRONMENT)
 
 
@@ -96,18 +96,18 @@ def _print(then: str, now: str, found: list[Change]) -> None:
         return
     out()
     rows, styles = [("change", "what", "details")], {}
-    for one in found:
-        what, text = one.what, one.text
-        if one.finding is not None:
-            what = one.finding.check.severity.value
-            text = f"{one.finding.id}: {text}"
+    for change in found:
+        what, text = change.what, change.text
+        if change.finding is not None:
+            what = change.finding.check.severity.value
+            text = f"{change.finding.id}: {text}"
             styles[len(rows)] = STYLES[what]
-        rows.append((one.how, what, text))
+        rows.append((change.how, what, text))
     show_rows(rows, styles=styles)
-    for one in found:
-        if one.lines:
+    for change in found:
+        if change.lines:
             out()
-            out(safe_line(one.text, 500), "bold")
-        for line in one.lines:  # which is a stranger's
+            out(safe_line(change.text, 500), "bold")
+        for line in change.lines:  # which is a stranger's
             out(f"{MARGIN}{safe_line(line, 300)}", {"+": GOOD, "-": DOUBTFUL}.get(line[:1]))
     say(f"{counted(len(found), 'change')}.", DOUBTFUL)

@@ -31,7 +31,9 @@ def inspect_static(
         with ProgressBar(quiet=as_json) as bar:
             bar.begin(f"reading {ref}")
             read = static(make.snapshot(ref))
-        failures = [one for one in read.findings if least and one.check.severity.reaches(least)]
+        failures = [
+            finding for finding in read.findings if least and finding.check.severity.reaches(least)
+        ]
         if sarif is not None:
             report = Report(read.reference, read.findings, folder=folder_below_here(ref))
             write_report(sarif, reports.sarif(report, failures), [read.reference])
@@ -51,8 +53,8 @@ def _print_static(read: Static) -> None:
         show("entry", f"{read.snapshot.path}: no make_env is written at its top")
     _print_packages(read)
     _print_files(read)
-    for one in read.findings:
-        show_finding(one)
+    for finding in read.findings:
+        show_finding(finding)
     if not read.findings:
         show("findings", "none")
 
@@ -64,23 +66,23 @@ def _print_packages(read: Static) -> None:
     else:
         python = f", for Python {says.python}" if says.python else ""
         show("packages", f"{len(says.wanted)} in {says.source}{python}")
-    for one in says.wanted if says else ():
-        show("  package", str(one))
+    for package in says.wanted if says else ():
+        show("  package", str(package))
     for name, place in sorted(read.modules.items()):
         known = "" if read.is_brought(name) else ", and no package of that name is declared"
         show("  import", f"{name}: {place.file}:{place.line}{known}")
 
 
 def _print_files(read: Static) -> None:
-    kinds = Counter(one.kind for one in read.files)
+    kinds = Counter(file.kind for file in read.files)
     counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
-    total = size_text(sum(one.record.size for one in read.files))
+    total = size_text(sum(file.record.size for file in read.files))
     show("files", f"{len(read.files)}, {total}: {counts}")
     # first what is large or no text: a reader would miss it
-    odd = [one for one in read.files if one.record.size >= LARGE or one.kind not in _PLAIN]
-    rest = [one for one in read.files if one not in odd]
-    for one in (shown := [*odd, *rest][:_SHOWN]):
-        large = ", large" if one.record.size >= LARGE else ""
-        show("  file", f"{one.record.path}: {one.kind}, {size_text(one.record.size)}{large}")
+    odd = [file for file in read.files if file.record.size >= LARGE or file.kind not in _PLAIN]
+    rest = [file for file in read.files if file not in odd]
+    for file in (shown := [*odd, *rest][:_SHOWN]):
+        large = ", large" if file.record.size >= LARGE else ""
+        show("  file", f"{file.record.path}: {file.kind}, {size_text(file.record.size)}{large}")
     if len(shown) < len(read.files):
         show("  file", f"and {len(read.files) - len(shown)} more, which --json has")

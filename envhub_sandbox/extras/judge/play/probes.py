@@ -55,7 +55,7 @@ def leak(seen: Sequence[Usage], resets: int) -> tuple[str, str] | None:
     stack: only the first of them is reported.
     """
     for what, (check, least) in _LEAST.items():
-        counts = [one[what] for one in seen]
+        counts = [usage[what] for usage in seen]
         steps = [after - before for before, after in itertools.pairwise(counts)]
         if steps and min(steps) >= least:
             name, words = ("memory", size_text) if what == "memory_bytes" else (what, str)
@@ -75,7 +75,7 @@ def other_modes(env: VectorEnv[Any, Any, Any]) -> list[str]:
     """The modes that it declares and is not in. Trust: input from the worker."""
     declared = env.metadata.get("render_modes")
     given = declared if isinstance(declared, (list, tuple)) else ()
-    named = {one for one in given if isinstance(one, str)}
+    named = {mode for mode in given if isinstance(mode, str)}
     return [mode for mode in MODES if mode in named and mode != env.render_mode]
 
 
@@ -88,18 +88,18 @@ def wrong_frames(env: VectorEnv[Any, Any, Any]) -> Iterator[str]:
     if not isinstance(given, (tuple, list)) or len(given) != env.num_envs:
         yield f"{mode}: render() gave {shown(given)}, not one result for each sub-environment"
         return
-    for index, one in enumerate(given):
-        if not _fits(one, mode):
-            yield f"{mode}: sub-environment {index} gave {shown(one)}"
+    for index, result in enumerate(given):
+        if not _fits(result, mode):
+            yield f"{mode}: sub-environment {index} gave {shown(result)}"
             return
 
 
-def _fits(one: Any, mode: str) -> bool:
+def _fits(result: Any, mode: str) -> bool:
     if mode == "ansi":
-        return isinstance(one, str)
+        return isinstance(result, str)
     if mode == "rgb_array_list":
-        return isinstance(one, (list, tuple)) and all(map(is_frame, one))
-    return is_frame(one)
+        return isinstance(result, (list, tuple)) and all(map(is_frame, result))
+    return is_frame(result)
 
 
 # --- what LeRobot needs --------------------------------------------------------------------------
@@ -115,7 +115,7 @@ def step_limit(env: Any) -> int | None:
     stated = [getattr(env.spec, "max_episode_steps", None)]
     with contextlib.suppress(AttributeError, RemoteEnvError, TypeError):
         stated += env.get_attr("_max_episode_steps")
-    return next((one for one in stated if type(one) is int and one > 0), None)
+    return next((limit for limit in stated if type(limit) is int and limit > 0), None)
 
 
 def lerobot_lacks(

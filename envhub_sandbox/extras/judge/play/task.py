@@ -126,7 +126,8 @@ class TaskJudge:
 
     def film(self) -> None:
         """Last of all, so that no verdict depends on whether somebody looks."""
-        dead = ("survives", self._name) in {(one.id, one.task) for one in self._report.findings}
+        findings = self._report.findings
+        dead = ("survives", self._name) in {(finding.id, finding.task) for finding in findings}
         if self._pictured and not dead and self._env.render_mode == "rgb_array":
             self._tell("filming")
             self._play.film = film(self._env, seed=self._asked.seed)
@@ -170,14 +171,14 @@ class TaskJudge:
                 spread = self._played(self._of(suites), mode, like=second)
             self._same("workers", first, spread, "with one worker and with two")
 
-    def _same(self, check: str, one: Trace, other: Trace, where: str) -> bool:
+    def _same(self, check: str, trace: Trace, other: Trace, where: str) -> bool:
         """Judge whether two plays are the same, and return whether they are not."""
-        at = one.differs_from(other)
+        at = trace.differs_from(other)
         if at is None:
             self._say(check, [])
             return False
         step = f"step {at}" if at else "the reset"
-        self._say(check, [f"{step} differs {where}{one.difference(other, at)}"])
+        self._say(check, [f"{step} differs {where}{trace.difference(other, at)}"])
         return True
 
     def _played(self, env: Env, mode: str | None, **changes: Any) -> Trace:

@@ -78,7 +78,7 @@ class Trace:
     def differs_from(self, other: Trace) -> int | None:
         """The first step of both that differs, 0 for the reset; None if none does."""
         pairs = enumerate(zip(self.steps, other.steps, strict=False))
-        return next((number for number, (one, two) in pairs if one != two), None)
+        return next((number for number, (mine, theirs) in pairs if mine != theirs), None)
 
     def difference(self, other: Trace, at: int) -> str:
         """``": "`` and what differs in the results of a step; empty if either has not kept them."""
@@ -166,7 +166,7 @@ def _judge(trace: Trace, result: tuple[Any, ...], ended: Any, mode: str | None, 
     done = np.logical_or(np.asarray(terminations, bool), np.asarray(truncations, bool))
     trace.episodes += int(done.sum())
     if done.any():
-        keys = {key for one in (infos, infos.get("final_info")) for key in _texts(one)}
+        keys = {key for group in (infos, infos.get("final_info")) for key in _texts(group)}
         trace.ends |= set(itertools.islice(keys, _MOST_ENDS - len(trace.ends)))
     if not np.isfinite(np.asarray(rewards, np.float64)).all():
         trace.note("rewards", f"step {number}: {np.asarray(rewards).tolist()}")
@@ -198,8 +198,8 @@ def _leaves(value: Any, without: Collection[str] = ()) -> Iterator[Any]:
     elif isinstance(value, np.ndarray) and value.dtype == object:
         value = list(value.flat)
     if isinstance(value, (list, tuple)):
-        for one in value:
-            yield from _leaves(one, without)
+        for item in value:
+            yield from _leaves(item, without)
     else:
         yield value
 
@@ -303,7 +303,7 @@ def _feed(hashed: Any, value: Any) -> None:
             _feed(hashed, value[key])
     elif isinstance(value, (list, tuple, np.ndarray)):
         hashed.update(f"items {len(value)}".encode())
-        for one in value:
-            _feed(hashed, one)
+        for item in value:
+            _feed(hashed, item)
     else:
         hashed.update(f"{type(value).__name__} {value!r}".encode("utf-8", "replace"))

@@ -260,7 +260,7 @@ class _Build:
             "runtime": self._runtime(),
             "backend": self._project.backend,
             "backend_path": self._project.backend_path,
-            "known": (*(str(one.requirement) for one in self._project.requires), *known),
+            "known": (*(str(package.requirement) for package in self._project.requires), *known),
             "environment": version if self._source.commit else {},
         }
 

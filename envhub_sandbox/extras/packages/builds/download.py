@@ -100,7 +100,7 @@ def login_for(url: str) -> tuple[str, str] | None:
     settings = index.environment()
     host = _host(url)
     named = " ".join(settings.get(name, "") for name in _INDEXES).split()
-    for place in (url, *(re.sub(r"^[\w-]+=", "", one) for one in named)):
+    for place in (url, *(re.sub(r"^[\w-]+=", "", index_url) for index_url in named)):
         if _host(place) == host and (login := login_of(place)):
             return login
     with contextlib.suppress(OSError, netrc.NetrcParseError):

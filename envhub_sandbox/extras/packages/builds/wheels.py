@@ -122,16 +122,17 @@ def _fits(file: str, interpreter: Interpreter) -> None:
 
 def _files(archive: zipfile.ZipFile) -> None:
     members = archive.infolist()
-    if len(members) > MAX_FILES or sum(one.file_size for one in members) > MAX_UNPACKED:
+    if len(members) > MAX_FILES or sum(member.file_size for member in members) > MAX_UNPACKED:
         raise not_as_expected(f"it holds more than {MAX_FILES} files or {size_text(MAX_UNPACKED)}")
     check_zip(members, "it")
-    names = (one.filename + "_" * one.is_dir() for one in members)  # a folder as a file in it
+    # a folder as a file in it
+    names = (member.filename + "_" * member.is_dir() for member in members)
     check_listing_names([FileRecord(name, 0, "") for name in names], "it")
 
 
 def _info(archive: zipfile.ZipFile, name: str, version: Version) -> str:
     """Its one ``.dist-info``, which is that of the package and of the version."""
-    tops = {one.partition("/")[0] for one in archive.namelist()}
+    tops = {name.partition("/")[0] for name in archive.namelist()}
     found = [top for top in tops if top.endswith(".dist-info")]
     if len(found) != 1:
         raise not_as_expected(f"it holds {len(found)} folders .dist-info")
@@ -170,7 +171,7 @@ def _record(archive: zipfile.ZipFile, path: str) -> None:
     """Every file is in RECORD with its hash, and RECORD names no other."""
     rows = list(csv.reader(io.StringIO(_small(archive, path).decode())))
     said = {row[0]: row[1] for row in rows if len(row) == 3}
-    there = {one.filename for one in archive.infolist() if not one.is_dir()}
+    there = {member.filename for member in archive.infolist() if not member.is_dir()}
     signatures = {path, f"{path}.jws", f"{path}.p7s"}
     if there - said.keys() - signatures or said.keys() - there - signatures:
         raise not_as_expected("its RECORD lists other files than it has")
@@ -200,7 +201,7 @@ def recall(source: Source, interpreter: Interpreter) -> Path | None:
     place = root() / _key(source, interpreter)
     if not place.is_dir() or not folders.is_ours_alone(root()):
         return None
-    records = sorted(place.glob("[!.]*/built.json"), key=lambda one: -one.stat().st_mtime)
+    records = sorted(place.glob("[!.]*/built.json"), key=lambda record: -record.stat().st_mtime)
     return next(filter(None, map(_whole, records)), None)
 
 
@@ -245,7 +246,7 @@ def every() -> list[KeptWheel]:
             parse_wheel_filename(wheel.name)
             size, used = wheel.stat().st_size, record.stat().st_mtime
             found.append(KeptWheel(wheel.name, size, used, record.parent))
-    return sorted(found, key=lambda one: -one.used)
+    return sorted(found, key=lambda wheel: -wheel.used)
 
 
 def describe(wheel: Path) -> WheelOrigin | None:

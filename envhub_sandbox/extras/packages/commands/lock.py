@@ -150,10 +150,10 @@ def _check_options(context: typer.Context, *, is_check: bool) -> None:
     """Refuse options that would mean nothing. Raises ``UsageError``: there is one."""
     of_a_new_lock = {"output", "upgrade", "dependencies", "env_kwargs", "assets"}
     idle = of_a_new_lock if is_check else {"no_index"}
-    for one in context.command.params:
-        if one.name in idle and opt.is_typed(context, one.name):
+    for parameter in context.command.params:
+        if parameter.name in idle and opt.is_typed(context, parameter.name):
             why = "--check writes nothing" if is_check else "it needs --check FILE"
-            raise UsageError(f"{one.opts[0]} means nothing here: {why}")
+            raise UsageError(f"{parameter.opts[0]} means nothing here: {why}")
 
 
 def _check_platform() -> None:
@@ -260,7 +260,7 @@ def _print(
     if as_json:
         document = {"lock": str(path), "reference": lockfile.reference_of(made)}
         document |= {"commit": made.commit, "python": str(made.runner)}
-        packages = [f"{one.name}=={one.version}" for one in made.packages]
+        packages = [f"{package.name}=={package.version}" for package in made.packages]
         print_json({**document, "packages": packages, "changes": changes})
         return
     for line in changes:

@@ -133,7 +133,7 @@ def _remote(error: EnvHubError) -> RemoteEnvError | None:
 
 def _of_files(snapshot: Snapshot) -> str:
     folder = Path(snapshot.repo_id)
-    paths = [folder / one.path for one in snapshot.files] if folder.is_dir() else [folder]
+    paths = [folder / file.path for file in snapshot.files] if folder.is_dir() else [folder]
     newest = max(os.stat(path).st_mtime for path in paths)
     return datetime.fromtimestamp(newest, timezone.utc).strftime("%Y-%m-%d")
 

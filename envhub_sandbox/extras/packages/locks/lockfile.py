@@ -274,7 +274,7 @@ def written(lock: LockFile) -> str:
     ]
     if lock.spaces is not None:
         text += ["", "[tool.envhub.spaces]", *rows({"env-kwargs": lock.spaces.arguments})]
-        text += ["tasks = [", *(f"    {as_toml(_task(one))}," for one in lock.spaces.tasks), "]"]
+        text += ["tasks = [", *(f"    {as_toml(_task(task))}," for task in lock.spaces.tasks), "]"]
     return "\n".join([*text, ""])
 
 

@@ -69,21 +69,21 @@ def with_files(lock: LockFile, snapshot: Snapshot) -> LockFile:
         commit=snapshot.commit,
         entry=snapshot.path,
         files={record.path: record.digest for record in snapshot.files},
-        assets=tuple(one.pinned for one in snapshot.assets),
+        assets=tuple(asset.pinned for asset in snapshot.assets),
     )
 
 
 def _of_files(then: LockFile, now: LockFile) -> Iterator[str]:
     if then.repository != now.repository:
         both = (then.repository, now.repository)
-        names = ["a local folder" if one == LOCAL else one for one in both]
+        names = ["a local folder" if repository == LOCAL else repository for repository in both]
         yield f"repository: {names[0]} was locked, this is {names[1]}"
     if then.commit != now.commit:
         yield f"commit: {then.commit[:18]} was locked, this is {now.commit[:18]}"
     if then.entry != now.entry:
         yield f"entry file: {then.entry} was locked, this is {now.entry}"
     if set(then.assets) != set(now.assets):
-        old, new = (", ".join(sorted(one.assets)) or "none" for one in (then, now))
+        old, new = (", ".join(sorted(lock.assets)) or "none" for lock in (then, now))
         yield f"assets: {printable(old, 2000)} were locked, these are {printable(new, 2000)}"
     for name in sorted({*then.files, *now.files}):
         shown = printable(name, 200)
@@ -96,7 +96,7 @@ def _of_files(then: LockFile, now: LockFile) -> Iterator[str]:
 
 
 def _of_packages(then: Sequence[PylockPackage], now: Sequence[PylockPackage]) -> Iterator[str]:
-    before, after = ({one.name: one for one in packages} for packages in (then, now))
+    before, after = ({package.name: package for package in packages} for packages in (then, now))
     for name in sorted({*before, *after}):
         old, new = before.get(name), after.get(name)
         if old is None and new is not None:
@@ -111,13 +111,15 @@ def _of_package(then: PylockPackage, now: PylockPackage) -> Iterator[str]:
     if then.version != now.version:
         yield f"package {then.name}: {then.version} was locked, this is {now.version}"
         return
-    before, after = (one.origin.source.identity if one.origin else "" for one in (then, now))
+    before, after = (
+        package.origin.source.identity if package.origin else "" for package in (then, now)
+    )
     if before != after:
         yield f"package {then.name}: built of {before or 'no source'}, this of {after or 'none'}"
     there = {wheel.sha256 for wheel in now.wheels}
     for wheel in then.wheels:
         if wheel.sha256 not in there:
-            others = ", ".join(sorted(one[:12] for one in there)) or "none"
+            others = ", ".join(sorted(digest[:12] for digest in there)) or "none"
             yield (
                 f"package {then.name}=={then.version}: the file with SHA-256 "
                 f"{wheel.sha256[:12]}... was locked, there is {others}"
@@ -162,9 +164,9 @@ def locked(snapshot: Snapshot, choice: Choice, *, upgrade: bool = False) -> Lock
         override=tuple(map(str, choice.override)),
         without=choice.without,
         inferred=tuple(
-            f"{one.wanted.requirement} ({one.wanted.where})"
-            for one in request.guesses
-            if one.module in found.taken
+            f"{guess.wanted.requirement} ({guess.wanted.where})"
+            for guess in request.guesses
+            if guess.module in found.taken
         ),
         exclude_newer=request.exclude_newer,
     )
@@ -191,12 +193,14 @@ def _parsed(texts: Sequence[str]) -> tuple[WantedPackage, ...]:
 
 def relisted(lock: LockFile) -> LockFile:
     """The same with the files that the index has of its packages now."""
-    built = [one for one in lock.packages if one.origin is not None]
-    pins = [f"{one.name}=={one.version}" for one in lock.packages if one.origin is None]
+    built = [package for package in lock.packages if package.origin is not None]
+    pins = [
+        f"{package.name}=={package.version}" for package in lock.packages if package.origin is None
+    ]
     interpreter = interpreters.find(lock.runner.python)
     options = pylock.pins(lock.packages).options
     found = pylock.listed(pins, interpreter.path, options, refresh=True)
-    packages = tuple(sorted((*built, *found), key=lambda one: one.name))
+    packages = tuple(sorted((*built, *found), key=lambda package: package.name))
     return replace(lock, packages=packages)
 
 
@@ -230,7 +234,7 @@ def fingerprint_of_task(
 ) -> TaskFingerprint:
     """What is to be remembered of an environment. Trust: input from the worker, already checked."""
     spaces = fingerprint_of_spaces(observations, actions)
-    texts = (" ".join(str(one).split()) for one in (observations, actions))
+    texts = (" ".join(str(space).split()) for space in (observations, actions))
     seen, done = (printable(text, _TEXT).replace("\n", " ") for text in texts)
     return TaskFingerprint(suite, task, mode or "", seen, done, spaces)
 

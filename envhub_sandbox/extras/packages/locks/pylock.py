@@ -65,8 +65,8 @@ class PylockPackage:
     @property
     def pin(self) -> str:
         """As pip's ``--require-hashes`` reads it."""
-        known = [self.origin.wheel] if self.origin else [one.sha256 for one in self.wheels]
-        hashes = (f"    --hash=sha256:{one}" for one in known)
+        known = [self.origin.wheel] if self.origin else [wheel.sha256 for wheel in self.wheels]
+        hashes = (f"    --hash=sha256:{digest}" for digest in known)
         return " \\\n".join([f"{self.name}=={self.version}", *hashes]) + "\n"
 
 
@@ -87,7 +87,9 @@ def described(lock: Lock, python: str) -> tuple[PylockPackage, ...]:
     built = _origins(lock)
     kept = []
     for package in found:
-        origin = next((built[one.sha256] for one in package.wheels if one.sha256 in built), None)
+        origin = next(
+            (built[wheel.sha256] for wheel in package.wheels if wheel.sha256 in built), None
+        )
         if origin is not None:
             kept.append(PylockPackage(package.name, package.version, (), origin))
             continue
@@ -114,7 +116,7 @@ def listed(
             *(("--refresh",) if refresh else ()),
         ],
         what="the files of the packages could not be listed",
-        given="".join(f"{one}\n" for one in versions if "==" in one),
+        given="".join(f"{version}\n" for version in versions if "==" in version),
         timeout_s=_DESCRIBE_S,
     )
     where = "the answer of uv"
@@ -136,7 +138,7 @@ def read(document: Mapping[str, Any], where: str) -> tuple[PylockPackage, ...]:
     given = document.get("packages")
     if not isinstance(given, list) or len(given) > MAX_PACKAGES:
         raise LockError(f"packages in {where} is not a list of at most {MAX_PACKAGES}")
-    found = [_package(one, where) for one in given]
+    found = [_package(row, where) for row in given]
     names = [package.name for package in found]
     if len(set(names)) != len(names):
         raise LockError(f"{where} names a package twice; a lock of envhub is for one interpreter")
@@ -217,7 +219,7 @@ def _origins(lock: Lock) -> dict[str, WheelOrigin]:
     folders = [Path(option) for option in lock.options if option.startswith("/")]
     wheels = [wheel for folder in folders for wheel in folder.glob("*.whl")]
     found = [built for built in map(describe, wheels) if built is not None]
-    return {one.wheel: one for one in found}
+    return {origin.wheel: origin for origin in found}
 
 
 def written(packages: Sequence[PylockPackage]) -> str:
@@ -228,7 +230,8 @@ def written(packages: Sequence[PylockPackage]) -> str:
         if package.origin is not None:
             lines += rows(_of_origin(package.origin))
         else:
-            lines += ["wheels = [", *(f"    {as_toml(_row(one))}," for one in package.wheels), "]"]
+            wheels = (f"    {as_toml(_row(wheel))}," for wheel in package.wheels)
+            lines += ["wheels = [", *wheels, "]"]
     return "\n".join([*lines, ""])
 
 
