@@ -151,39 +151,34 @@ def test_hand_made_descriptor_is_understood() -> None:
     assert_same(np.arange(6, dtype="f4").reshape(2, 3), read(descriptor(F4, 2, 3), tail))
 
 
+ONE = descriptor(F4, 1)
+FRAMED = descriptor(F4, 1, frame=True)
+
+
 @pytest.mark.parametrize(
     ("spoiled", "tail", "frames"),
     [
-        (b"", b"", ()),
-        (b"\x0a", b"", ()),
-        (descriptor(F4, 1)[:-1], bytes(4), ()),
-        (descriptor(F4, 1) + b"\0", bytes(4), ()),
-        (descriptor(F4, 1), bytes(3), ()),
-        (descriptor(F4, 1), bytes(5), ()),
-        (descriptor(F4, 1, frame=True), bytes(4), ()),
-        (descriptor(F4, 1, frame=True), b"", (bytes(3),)),
-        (descriptor(F4, 1, frame=True), b"", (bytes(5),)),
-        (descriptor(F4, 1, frame=True), b"", (bytes(4), bytes(4))),
-        (descriptor(F4, 0, frame=True), b"", (b"",)),
-        (descriptor(F4, 1), b"", (bytes(4),)),
-        (descriptor(F4, 2**62), bytes(4), ()),
+        *((lie, b"", ()) for lie in (b"", b"\x0a", bytes((F4, 33)) + bytes(8 * 33))),
+        *((lie, bytes(4), ()) for lie in (ONE[:-1], ONE + b"\0", FRAMED)),
+        *((ONE, bytes(size), ()) for size in (3, 5)),
+        *((FRAMED, b"", frames) for frames in ((bytes(3),), (bytes(5),), (bytes(4), bytes(4)))),
+        *((descriptor(F4, 0, frame=True), b"", (b"",)), (ONE, b"", (bytes(4),))),
+        *((descriptor(F4, size), bytes(4), ()) for size in (2**62, 2**64 - 1)),
         (descriptor(F4, 2**62 + 1, 4), bytes(16), ()),
-        (descriptor(F4, 2**64 - 1), bytes(4), ()),
-        (descriptor(F4, 2**63, 2**63, 2), b"", ()),
-        (descriptor(F4, 0, 2**62), b"", ()),
-        (descriptor(F4, *(2,) * 40), b"", ()),
-        (bytes((F4, 33)) + bytes(8 * 33), b"", ()),
+        *((descriptor(F4, *s), b"", ()) for s in ((2**63, 2**63, 2), (0, 2**62), (2,) * 40)),
         (bytes((F4, 2)) + bytes(8), b"", ()),
-        (descriptor(18, 1), bytes(4), ()),
-        (descriptor(255, 1), bytes(4), ()),
+        *((descriptor(code, 1), bytes(4), ()) for code in (18, 255)),
         (descriptor(TEXT_CODE), b"", ()),
-        (descriptor(TEXT_CODE, 1, parameter=0), b"", ()),
-        (descriptor(TEXT_CODE, 1, parameter=2_000_000_000), b"", ()),
+        *((descriptor(TEXT_CODE, 1, parameter=p), b"", ()) for p in (0, 2_000_000_000)),
         (descriptor(BYTES_CODE, 1, parameter=2**32 - 1), b"", ()),
-        (descriptor(TEXT_CODE, 1, parameter=1), struct.pack("<I", 0x110000), ()),
-        (descriptor(TEXT_CODE, 1, parameter=1), struct.pack("<I", 0xD800), ()),
-        (descriptor(TIME_CODE, 1, parameter=0x0000_0001), bytes(8), ()),
-        (descriptor(TIME_CODE, 1, parameter=0x0000_01FF), bytes(8), ()),
+        *(
+            (descriptor(TEXT_CODE, 1, parameter=1), struct.pack("<I", point), ())
+            for point in (0x110000, 0xD800)
+        ),
+        *(
+            (descriptor(TIME_CODE, 1, parameter=p), bytes(8), ())
+            for p in (0x0000_0001, 0x0000_01FF)
+        ),
         (descriptor(TIMEDELTA_CODE, 1, parameter=0x0000_0200), bytes(8), ()),
         (descriptor(BOOL, 2), b"\1\2", ()),
         (descriptor(BOOL, 2000), bytes(1999) + b"\xff", ()),

@@ -103,36 +103,25 @@ def test_fields_of_another_type_are_refused(name: str, lie: object) -> None:
         read(with_env(name, lie))
 
 
-@pytest.mark.parametrize(
-    ("name", "lie"),
-    [
-        ("num_envs", 0),
-        ("num_envs", -1),
-        ("num_envs", MAX_NUM_ENVS + 1),
-        ("num_envs", True),
-        ("task", True),
-        ("task", None),
-        ("task", "x" * (MAX_NAME + 1)),
-        ("suite", "x" * (MAX_NAME + 1)),
-        ("suite", None),
-        ("shardable", 1),
-        ("sync", None),
-        ("autoreset_mode", "Sometimes"),
-        ("autoreset_mode", 1),
-        ("metadata", None),
-        ("metadata", {"x" * (MAX_NAME + 1): 1}),
-        ("metadata", {str(number): 1 for number in range(MAX_NAMES + 1)}),
-        ("render_mode", 3),
-        ("spec", {1: 2}),
-        ("spec", "X-v0"),
-        ("attributes", ["a"]),
-        ("attributes", ("a", 1)),
-        ("attributes", ("a",) * (MAX_NAMES + 1)),
-        ("type_name", None),
-        ("single_action_space", None),
-        ("observation_space", {}),
-    ],
-)
+LONG = "x" * (MAX_NAME + 1)
+LIES: dict[str, tuple[object, ...]] = {
+    "num_envs": (0, -1, MAX_NUM_ENVS + 1, True),
+    "task": (True, None, LONG),
+    "suite": (LONG, None),
+    "shardable": (1,),
+    "sync": (None,),
+    "autoreset_mode": ("Sometimes", 1),
+    "metadata": (None, {LONG: 1}, {str(number): 1 for number in range(MAX_NAMES + 1)}),
+    "render_mode": (3,),
+    "spec": ({1: 2}, "X-v0"),
+    "attributes": (["a"], ("a", 1), ("a",) * (MAX_NAMES + 1)),
+    "type_name": (None,),
+    "single_action_space": (None,),
+    "observation_space": ({},),
+}
+
+
+@pytest.mark.parametrize(("name", "lie"), [(n, lie) for n, lies in LIES.items() for lie in lies])
 def test_impossible_values_are_refused(name: str, lie: object) -> None:
     with pytest.raises(RemoteProtocolError):
         read(with_env(name, lie))

@@ -93,18 +93,10 @@ def test_metadata_keeps_what_people_read() -> None:
 @pytest.mark.parametrize(
     ("key", "lie"),
     [
-        ("render_fps", np.zeros(3)),
-        ("render_fps", "30"),
-        ("render_fps", 0),
-        ("render_fps", -1),
-        ("render_fps", float("nan")),
-        ("render_fps", float("inf")),
-        ("render_fps", 10**400),
-        ("render_fps", True),
-        ("render_modes", "rgb_array"),
-        ("render_modes", [1]),
-        ("autoreset_mode", np.zeros(2)),
-        ("autoreset_mode", "NextStep"),
+        *(("render_fps", lie) for lie in (np.zeros(3), "30", 0, -1, float("nan"), float("inf"))),
+        *(("render_fps", lie) for lie in (10**400, True)),
+        *(("render_modes", lie) for lie in ("rgb_array", [1])),
+        *(("autoreset_mode", lie) for lie in (np.zeros(2), "NextStep")),
     ],
 )
 def test_metadata_on_which_gymnasium_acts_is_typed(key: str, lie: object) -> None:
@@ -147,16 +139,9 @@ def test_specs_keep_their_facts_only() -> None:
 @pytest.mark.parametrize(
     "lie",
     [
-        {"id": 3},
-        {"id": "x" * 513},
-        {"id": "\x1b[2J"},
-        {"max_episode_steps": "5"},
-        {"max_episode_steps": True},
-        {"max_episode_steps": 2**63},
-        {"max_episode_steps": np.zeros(2)},
-        {"reward_threshold": "1"},
-        {"reward_threshold": 10**400},
-        {"nondeterministic": 1},
+        *({"id": lie} for lie in (3, "x" * 513, "\x1b[2J")),
+        *({"max_episode_steps": lie} for lie in ("5", True, 2**63, np.zeros(2))),
+        *({"reward_threshold": "1"}, {"reward_threshold": 10**400}, {"nondeterministic": 1}),
         "X-v0",
     ],
     ids=repr,

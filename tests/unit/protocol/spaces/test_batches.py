@@ -114,24 +114,20 @@ def test_batches_conform_to_their_space(name: str) -> None:
     assert not batches.conforms(space, batch, 2)
 
 
+THREE = np.zeros(3, np.int64)
+
+
 @pytest.mark.parametrize(
     ("name", "batch"),
     [
-        ("box", np.zeros((3, 2, 3), np.float64)),
-        ("box", np.zeros((3, 3, 2), np.float32)),
-        ("box", np.zeros((3, 2, 3), np.float32).tolist()),
-        ("box", None),
-        ("scalar box", np.zeros((3, 1))),
-        ("discrete", np.zeros(3, np.int32)),
-        ("discrete", np.zeros((3, 1), np.int64)),
-        ("text", ["a", "b", "c"]),
-        ("text", "abc"),
-        ("dict", {"b": np.zeros(3, np.int64)}),
-        ("dict", (np.zeros(3, np.int64), {})),
-        ("dict", {"b": np.zeros(3, np.int64), "a": {"image": np.zeros((3, 2), np.float64)}}),
-        ("tuple", (np.zeros(3, np.int64),)),
-        ("tuple", [np.zeros(3, np.int64), {}]),
-        ("tuple", (np.zeros(3, np.int64), {"text": ("a", "b", "c"), "g": ("a",)})),
+        *(("box", np.zeros(*shape)) for shape in (((3, 2, 3),), ((3, 3, 2), np.float32))),
+        *(("box", np.zeros((3, 2, 3), np.float32).tolist()), ("box", None)),
+        *(("scalar box", np.zeros((3, 1))), ("discrete", np.zeros(3, np.int32))),
+        *(("discrete", np.zeros((3, 1), np.int64)), ("text", ["a", "b", "c"]), ("text", "abc")),
+        *(("dict", {"b": THREE}), ("dict", (THREE, {}))),
+        ("dict", {"b": THREE, "a": {"image": np.zeros((3, 2), np.float64)}}),
+        *(("tuple", (THREE,)), ("tuple", [THREE, {}])),
+        ("tuple", (THREE, {"text": ("a", "b", "c"), "g": ("a",)})),
     ],
 )
 def test_other_structures_shapes_and_dtypes_do_not_conform(name: str, batch: object) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import tracemalloc
 import warnings
+from collections.abc import Iterable
 from typing import Any
 
 import gymnasium as gym
@@ -19,7 +20,13 @@ from envhub_sandbox.errors import WorkerTimeoutError
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.spaces.reader import ELEMENT_BYTES, SPACE_BYTES, SpaceReader
-from envhub_worker.protocol.spaces.spaces import MAX_SPACE_DEPTH, OpaqueSpace, encode_space
+from envhub_worker.protocol.spaces.spaces import (
+    MAX_SPACE_DEPTH,
+    OpaqueSpace,
+    encode_space,
+    seeded_nodes,
+    seeded_states,
+)
 from tests.support.compare import assert_same
 from tests.support.decode import decode
 from tests.support.wire import decode_space
@@ -429,93 +436,39 @@ def without(value: dict[str, Any], name: str) -> dict[str, Any]:
     return {key: item for key, item in value.items() if key != name}
 
 
+def lies(honest: dict[str, Any], **fields: Iterable[object]) -> list[dict[str, Any]]:
+    """Descriptions of which one attribute is not as it should be."""
+    return [honest | {name: lie} for name, values in fields.items() for lie in values]
+
+
 @pytest.mark.parametrize(
     "value",
     [
-        None,
-        [],
-        {},
-        {"kind": 1},
-        {"kind": []},
-        {"kind": "Box"},
-        {"kind": "os.system"},
-        without(BOX, "low"),
-        BOX | {"seed": 1},
-        BOX | {"dtype": "object"},
-        BOX | {"dtype": "V2000000000"},
-        BOX | {"dtype": "float128"},
-        BOX | {"dtype": None},
-        BOX | {"dtype": "int64"},
-        BOX | {"shape": [2]},
-        BOX | {"shape": (-1,)},
-        BOX | {"shape": (2.0,)},
-        BOX | {"shape": (True,)},
-        BOX | {"shape": (np.int64(2),)},
-        BOX | {"shape": (2**31,)},
-        BOX | {"shape": (1,) * 33},
-        BOX | {"shape": None},
-        BOX | {"low": 0.0},
-        BOX | {"low": None},
-        BOX | {"low": np.float32(0)},
-        BOX | {"low": np.array(0.0)},
-        BOX | {"low": np.array([0, 0, 0], "f4")},
-        BOX | {"low": np.array([[0, 0]], "f4")},
-        BOX | {"low": np.array(["x"], object)},
-        BOX | {"low": np.array(2, "f4")},
-        BOX | {"low": np.array(np.nan, "f4"), "high": np.array(np.nan, "f4")},
-        BOX | {"bounded_below": ONE},
-        BOX | {"bounded_below": True},
-        BOX | {"bounded_above": np.array([True, True, False])},
-        DISCRETE | {"n": 0},
-        DISCRETE | {"n": -1},
-        DISCRETE | {"n": 2.0},
-        DISCRETE | {"n": True},
-        DISCRETE | {"n": 2**63},
-        DISCRETE | {"n": 2**200},
-        DISCRETE | {"start": None},
-        DISCRETE | {"start": 2**63 - 2},
-        DISCRETE | {"start": -(2**63) - 1},
+        *(None, [], {}, {"kind": 1}, {"kind": []}, {"kind": "Box"}, {"kind": "os.system"}),
+        *(without(BOX, "low"), BOX | {"seed": 1}),
+        *lies(BOX, dtype=("object", "V2000000000", "float128", None, "int64")),
+        *lies(BOX, shape=([2], (-1,), (2.0,), (True,), (np.int64(2),), (2**31,), (1,) * 33, None)),
+        *lies(BOX, low=(0.0, None, np.float32(0), np.array(0.0), np.array([0, 0, 0], "f4"))),
+        *lies(BOX, low=(np.array([[0, 0]], "f4"), np.array(["x"], object), np.array(2, "f4"))),
+        BOX | dict.fromkeys(("low", "high"), np.array(np.nan, "f4")),
+        *lies(BOX, bounded_below=(ONE, True), bounded_above=[np.array([True, True, False])]),
+        *lies(DISCRETE, n=(0, -1, 2.0, True, 2**63, 2**200), dtype=("float32", "bool")),
+        *lies(DISCRETE, start=(None, 2**63 - 2, -(2**63) - 1)),
         DISCRETE | {"dtype": "int8", "n": 200},
-        DISCRETE | {"dtype": "float32"},
-        DISCRETE | {"dtype": "bool"},
-        MULTI | {"nvec": np.array([2, 0])},
-        MULTI | {"nvec": np.array([2, -3])},
-        MULTI | {"nvec": np.array([2.0, 3.0])},
-        MULTI | {"nvec": np.array([2, 3, 4])},
-        MULTI | {"start": np.array([0, 0, 0])},
-        MULTI | {"dtype": "float64"},
-        {"kind": "multi_binary", "n": 0},
-        {"kind": "multi_binary", "n": -1},
-        {"kind": "multi_binary", "n": 2.5},
-        {"kind": "multi_binary", "n": (0,)},
-        {"kind": "multi_binary", "n": (2, "x")},
-        {"kind": "multi_binary", "n": np.array([2])},
-        TEXT | {"characters": "aa"},
-        TEXT | {"characters": ["ab"]},
-        TEXT | {"characters": "a\ud800"},
-        TEXT | {"min_length": -1},
-        TEXT | {"min_length": 4},
-        TEXT | {"max_length": 3.0},
-        TEXT | {"max_length": None},
-        DICT | {"keys": ["a"]},
-        DICT | {"keys": ["a", "a"]},
-        DICT | {"keys": ["a", []]},
-        DICT | {"keys": ("a", "b")},
-        DICT | {"keys": [1, True]},
-        DICT | {"sort_keys": 1},
+        *lies(MULTI, nvec=map(np.array, ([2, 0], [2, -3], [2.0, 3.0], [2, 3, 4]))),
+        *lies(MULTI, start=[np.array([0, 0, 0])], dtype=["float64"]),
+        *lies({"kind": "multi_binary"}, n=(0, -1, 2.5, (0,), (2, "x"), np.array([2]))),
+        *lies(TEXT, characters=("aa", ["ab"], "a\ud800")),
+        *lies(TEXT, min_length=(-1, 4), max_length=(3.0, None)),
+        *lies(DICT, keys=(["a"], ["a", "a"], ["a", []], ("a", "b"), [1, True]), sort_keys=[1]),
         DICT | {"spaces": {"a": DISCRETE, "b": DISCRETE}},
-        {"kind": "tuple", "spaces": None},
-        {"kind": "tuple", "spaces": [None]},
-        {"kind": "tuple", "spaces": [spaces.Discrete(2)]},
+        *lies({"kind": "tuple"}, spaces=(None, [None], [spaces.Discrete(2)])),
         {"kind": "one_of", "spaces": [{"kind": "one_of", "spaces": 3}]},
         {"kind": "sequence", "space": None, "stack": False},
         {"kind": "sequence", "space": DISCRETE, "stack": 1},
-        {"kind": "graph", "node": None, "edge": None},
-        {"kind": "graph", "node": DISCRETE, "edge": 5},
-        OPAQUE | {"type": 1},
-        OPAQUE | {"text": None},
-        OPAQUE | {"dtype": np.float32},
-        OPAQUE | {"shape": (2**40,)},
+        *lies({"kind": "graph", "node": None}, edge=[None]),
+        *lies({"kind": "graph", "node": DISCRETE}, edge=[5]),
+        *lies(OPAQUE, type=[1], text=[None], dtype=[np.float32], shape=[(2**40,)]),
     ],
     ids=lambda value: repr(value)[:60],
 )
@@ -533,3 +486,41 @@ def test_description_of_a_custom_space_is_cleaned() -> None:
     )
     assert repr(space).isprintable()
     assert len(repr(space)) < 2000
+
+
+# --- generators ---------------------------------------------------------------------------------
+
+
+def seedable() -> spaces.Dict:
+    pair = spaces.Tuple([spaces.Discrete(2), spaces.Box(0, 1, (2,), np.float32)])
+    return spaces.Dict({"a": spaces.MultiBinary(3), "b": pair})
+
+
+def test_nodes_come_in_a_fixed_order() -> None:
+    kinds = [type(node).__name__ for node in seeded_nodes(seedable())]
+    assert kinds == ["Dict", "MultiBinary", "Tuple", "Discrete", "Box"]
+
+
+def test_what_nobody_seeded_does_not_travel() -> None:
+    """Even where it has drawn; a remembered description would make each run the same."""
+    space = seedable()
+    space.sample()
+    assert seeded_states(space) is None
+
+
+def test_the_same_seed_is_the_same_states() -> None:
+    seeded = [seedable() for _ in range(3)]
+    for space, seed in zip(seeded, (1, 1, 2), strict=True):
+        space.seed(seed)
+    first, same, other = (repr(seeded_states(space)) for space in seeded)
+    assert first == same != other
+    seeded[0].sample()
+    assert repr(seeded_states(seeded[0])) != same
+
+
+def test_a_shared_generator_is_told_once() -> None:
+    one = spaces.Discrete(2, seed=3)
+    states = seeded_states(spaces.Tuple([one, copy.copy(one)]))
+    assert states is not None
+    assert states[2] == 1
+    assert not isinstance(states[1], int)

@@ -18,18 +18,10 @@ from envhub_worker.supervisor.records import RefusedError
 @pytest.mark.parametrize(
     ("path", "why"),
     [
-        ("/etc/passwd", "absolute"),
-        ("a/../b", "'..' step"),
-        ("a//b", "empty"),
-        ("./a", "'.' or"),
-        ("", "empty"),
-        ("a\\b", "backslash"),
-        ("a\nb", "control character"),
-        ("a\udcff", "not UTF-8"),
-        ("a/" * 200 + "b", "too deep"),
-        ("a" * 300, "too long"),
-        ("env.py", ""),
-        ("sub/ünïcode name.py", ""),
+        *(("/etc/passwd", "absolute"), ("a/../b", "'..' step"), ("a//b", "empty"), ("", "empty")),
+        *(("./a", "'.' or"), ("a\\b", "backslash"), ("a\nb", "control character")),
+        *(("a\udcff", "not UTF-8"), ("a/" * 200 + "b", "too deep"), ("a" * 300, "too long")),
+        *(("env.py", ""), ("sub/ünïcode name.py", "")),
     ],
 )
 def test_paths_of_clients_stay_below_their_snapshot(path: str, why: str) -> None:
@@ -45,15 +37,9 @@ def listed(*paths: str, size: Any = 3) -> tuple[Any, ...]:
 @pytest.mark.parametrize(
     "files",
     [
-        (),
-        listed("a", "a"),
-        listed("a", "a/b"),
-        listed("../a"),
-        listed("a", size=-1),
-        listed("a", size="3"),
-        listed("a", size=1 << 60),
-        (("a", 3, b"short"),),
-        (3,),
+        *((), listed("a", "a"), listed("a", "a/b"), listed("../a")),
+        *(listed("a", size=size) for size in (-1, "3", 1 << 60)),
+        *((("a", 3, b"short"),), (3,)),
     ],
 )
 def test_listings_that_break_a_rule_are_refused(files: tuple[Any, ...]) -> None:

@@ -147,15 +147,10 @@ def test_container_without_landlock_says_so() -> None:
 @pytest.mark.parametrize(
     ("abi", "network", "wanted"),
     [
-        (1, "none", Ruleset(2**13 - 1, 0, 0)),
-        (2, "none", Ruleset(2**14 - 1, 0, 0)),
-        (3, "none", Ruleset(2**15 - 1, 0, 0)),
-        (4, "none", Ruleset(2**15 - 1, 3, 0)),
-        (5, "none", Ruleset(2**16 - 1, 3, 0)),
-        (6, "none", Ruleset(2**16 - 1, 3, 3)),
-        (9, "none", Ruleset(2**16 - 1, 3, 3)),
-        (7, "loopback", Ruleset(2**16 - 1, 0, 3)),
-        (7, "host", Ruleset(2**16 - 1, 0, 3)),
+        *((abi, "none", Ruleset(2**bits - 1, 0, 0)) for abi, bits in ((1, 13), (2, 14), (3, 15))),
+        *((abi, "none", Ruleset(2**bits - 1, 3, 0)) for abi, bits in ((4, 15), (5, 16))),
+        *((abi, "none", Ruleset(2**16 - 1, 3, 3)) for abi in (6, 9)),
+        *((7, network, Ruleset(2**16 - 1, 0, 3)) for network in ("loopback", "host")),
     ],
 )
 def test_landlock_asks_for_what_the_abi_knows(abi: int, network: str, wanted: Ruleset) -> None:

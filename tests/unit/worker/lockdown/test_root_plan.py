@@ -7,17 +7,8 @@ import pytest
 from envhub_worker.lockdown.root_plan import HostFiles, RootPlan, outermost, plan_root
 
 FOLDERS = {
-    "/",
-    "/usr",
-    "/usr/bin",
-    "/usr/lib",
-    "/etc/fonts",
-    "/opt/py",
-    "/opt/py/lib",
-    "/data/store",
-    "/home/ann",
-    "/home/ann/proj",
-    "/sys/devices/system/cpu",
+    *("/", "/usr", "/usr/bin", "/usr/lib", "/etc/fonts", "/opt/py", "/opt/py/lib", "/data/store"),
+    *("/home/ann", "/home/ann/proj", "/sys/devices/system/cpu"),
 }
 FILES = {"/etc/ld.so.cache", "/etc/resolv.conf", "/etc/hosts"}
 LINKS = {

@@ -6,6 +6,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest.mock import MagicMock, Mock
 
 import pytest
 
@@ -20,57 +21,19 @@ from envhub_worker.supervisor.runner_stream import RunnerLink
 from envhub_worker.supervisor.served_slabs import ServedSlabs
 
 
-class _Jail:
-    """One that has told something which nobody has read yet; or that cannot be heard."""
-
-    def __init__(self, *events: Any, fails: bool = False) -> None:
-        self.events = list(events)
-        self.fails = fails
-        self.killed = False
-
-    def fileno(self) -> int:
-        return -1 if self.killed else 99
-
-    def poll(self) -> list[Any]:
-        if self.fails:
-            raise AssertionError("no room for a descriptor")
-        told, self.events = self.events, []
-        return [] if self.killed else told
-
-    def kill(self) -> None:
-        self.killed = True
-
-
-class _Silent:
-    """Everything else that a jail has to do with."""
-
-    def __getattr__(self, name: str) -> Any:
-        return lambda *arguments: ""
-
-
-class _Told(Witness):
-    """Writes down what the server itself has met."""
-
-    def __init__(self) -> None:
-        self.failures: list[str] = []
-
-    def failed(self, error: Exception) -> None:
-        self.failures.append(str(error))
-
-
 @contextmanager
-def told_of(jail: Any) -> Iterator[tuple[JailEvents, JailRecord, _Told, list[Any]]]:
+def told_of(jail: Any) -> Iterator[tuple[JailEvents, JailRecord, Mock, list[Any]]]:
     """The events of one jail, its record, what went wrong, and what is replied to whom."""
-    silent: Any = _Silent()
-    said: list[tuple[Any, m.Message]] = []
-    entry, witness = JailRecord(7, "one", b"", jail, (), silent), _Told()
+    silent, witness, replies = MagicMock(), Mock(spec=Witness), list[tuple[Any, m.Message]]()
+    silent.text.return_value = ""
+    entry = JailRecord(7, "one", b"", jail, (), silent)
 
     def reply(asker: Any, message: m.Message, *_: object) -> None:
-        said.append((asker, message))
+        replies.append((asker, message))
 
     events = JailEvents(silent, reply, {7: entry}, silent, witness)
     try:
-        yield events, entry, witness, said
+        yield events, entry, witness, replies
     finally:
         events.close()
 
@@ -81,21 +44,26 @@ def test_what_a_jail_was_denied_is_known_when_it_is_ended(fails: bool) -> None:
 
     Its last words may be lost, as where its server has no descriptors left; that goes on.
     """
-    tried = CallDenied("socket", "AF_INET")
-    jail = _Jail(tried, RunnerExited(1, None, 9, "signal"), fails=fails)
+    jail = Mock()
+    jail.poll.return_value = [
+        CallDenied("socket", "AF_INET"),
+        RunnerExited(1, None, 9, "signal"),
+    ]
+    if fails:
+        jail.poll.side_effect = AssertionError("no room for a descriptor")
     with told_of(jail) as (events, entry, witness, _):
         events.end(entry, whole_jail("protocol"))
         assert entry.denied == ([] if fails else ["socket AF_INET"])
-        assert witness.failures == (["no room for a descriptor"] if fails else [])
+        assert witness.failed.called is fails
         assert entry.death is not None
         assert entry.death.reason == "protocol"
-        assert jail.killed
+        assert jail.kill.called
 
 
 @pytest.mark.parametrize("stepped", [True, False])
 def test_who_waits_for_a_jail_that_another_closes_hears_of_it(stepped: bool) -> None:
     """A thread that waits for a step, which the server takes or the runner's stream does."""
-    jail: Any = _Jail()
+    jail = MagicMock()
     ours, theirs = socket.socketpair()
     pending: Any = Pending("who steps", "step", [None])  # type: ignore[arg-type]
     with theirs, told_of(jail) as (events, entry, _, said):

@@ -1,4 +1,4 @@
-"""A store that several servers of a machine use: what one has brought is there for all."""
+"""What clients bring: of a store that several servers of a machine use, and of one key."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ from pathlib import Path
 import pytest
 
 from envhub_worker.extras.access.quotas import Quotas
-from envhub_worker.extras.access.store.blob_store import SharedUse
+from envhub_worker.extras.access.store.blob_store import (
+    BLOCK_BYTES,
+    BlobStore,
+    ListedFile,
+    SharedUse,
+)
 from envhub_worker.extras.access.store.uploads import Uploads
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
@@ -84,3 +89,14 @@ def test_a_share_is_taken_back_after_a_vain_try(tmp_path: Path) -> None:
     for use, expected in ((uses[0], True), (uses[1], False), (uses[0], False), (uses[1], False)):
         with use.alone() as alone:
             assert alone is expected
+
+
+def test_a_tree_that_cannot_be_finished_leaves_nothing(tmp_path: Path) -> None:
+    store, part = BlobStore(tmp_path), tmp_path / "part"
+    part.write_bytes(b"1")
+    sha256 = hashlib.sha256(b"1").digest()
+    store.take(part, sha256, 1)
+    with pytest.raises(RefusedError):
+        store.lay_out("ab", [ListedFile("env.py", 2, sha256)], lambda size: None)
+    assert list((tmp_path / "trees").iterdir()) == []
+    assert store.held == BLOCK_BYTES
