@@ -84,8 +84,8 @@ class Program(TyperGroup):
     A command is imported when it is called: until then it has its name and its line in the list.
     """
 
-    def __init__(self, **given: Any) -> None:
-        super().__init__(**given)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
         if not self.commands:
             self.commands = {
                 name: Command(name, help=text) for name, (text, _) in _COMMANDS.items()
@@ -143,16 +143,16 @@ def _wrong_usage(ctx: Any = None) -> Iterator[None]:
 class Command(TyperCommand):
     """One command, whose errors name the options that it has."""
 
-    def __init__(self, *args: Any, **given: Any) -> None:
-        super().__init__(*args, **given)
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
         paragraphs = python.cleandoc(self.help or "").split("\n\n")
         # rich keeps the ends of lines of all but the first
-        self.help = "\n\n".join(" ".join(one.split()) for one in paragraphs)
+        self.help = "\n\n".join(" ".join(text.split()) for text in paragraphs)
 
     def invoke(self, ctx: Any) -> Any:
         """Call the function."""
-        known = {name for parameter in self.params for name in parameter.opts}
-        with use_option_names(on_command_line(known)):
+        options = {name for parameter in self.params for name in parameter.opts}
+        with use_option_names(on_command_line(options)):
             return super().invoke(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
@@ -166,9 +166,9 @@ class Command(TyperCommand):
             text = getattr(parameter, "help", None)
             if text:
                 vars(parameter)["help"] = text.replace("[", "\\[")
-        later = [] if self._whole_help else [one for one in self.params if _comes_later(one)]
-        for one in later:
-            vars(one)["hidden"] = True
+        later = [] if self._whole_help else list(filter(_comes_later, self.params))
+        for parameter in later:
+            vars(parameter)["hidden"] = True
         if later:
             self.epilog = f"{len(later)} more options: {ctx.command_path} --help-all"
         super().format_help(ctx, formatter)
@@ -183,23 +183,23 @@ def _comes_later(parameter: Any) -> bool:
 
 def functions(name: str) -> dict[str, Callable[..., None]]:
     """The function of a command, or those of a group, by name."""
-    where = _COMMANDS[name][1]
-    found = {}
-    for one, place in ({name: where} if isinstance(where, str) else where).items():
-        module, _, function = place.partition(":")
-        found[one] = extras.required(f"envhub_sandbox.{module}", function, f"envhub {name}")
-    return found
+    address = _COMMANDS[name][1]
+    functions = {}
+    for command, path in ({name: address} if isinstance(address, str) else address).items():
+        module, _, function = path.partition(":")
+        functions[command] = extras.required(f"envhub_sandbox.{module}", function, f"envhub {name}")
+    return functions
 
 
 def whole_command(name: str) -> Any:
     """A command, or a group, with all its options."""
-    text, where = _COMMANDS[name]
-    command = _typer(text)
-    for one, function in functions(name).items():
-        command.command(one, cls=Command, no_args_is_help=one == "remove")(function)
-    group = typer.main.get_group(command)
+    text, address = _COMMANDS[name]
+    typer_group = _typer(text)
+    for command, function in functions(name).items():
+        typer_group.command(command, cls=Command, no_args_is_help=command == "remove")(function)
+    group = typer.main.get_group(typer_group)
     group.name = name
-    return group.commands[name] if isinstance(where, str) else group
+    return group.commands[name] if isinstance(address, str) else group
 
 
 def _typer(text: str, **options: Any) -> typer.Typer:

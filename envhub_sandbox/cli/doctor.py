@@ -109,13 +109,11 @@ def doctor(
 
     Policy(profile=profile)  # refuses a name that there is not, before anything is tried
     if server is not None:
-        what = "a server on another host"
-        place = extras.required("envhub_sandbox.extras.remote.sandbox", "RemoteSandbox", what)
-        examine_server = extras.required(
-            "envhub_sandbox.extras.remote.doctor", "examine_server", what
-        )
-        asked = place(server, insecure_loopback=insecure_loopback)
-        raise typer.Exit(examine_server(asked, profile, json=json))
+        purpose, module = "a server on another host", "envhub_sandbox.extras.remote"
+        remote = extras.required(f"{module}.sandbox", "RemoteSandbox", purpose)
+        examine_server = extras.required(f"{module}.doctor", "examine_server", purpose)
+        sandbox = remote(server, insecure_loopback=insecure_loopback)
+        raise typer.Exit(examine_server(sandbox, profile, json=json))
     if insecure_loopback:
         raise UsageError("--insecure-loopback needs a server: envhub doctor tcp://HOST:PORT")
     with ProgressBar(quiet=json) as bar, _scratch_folder() as folder:
@@ -149,14 +147,14 @@ def _scratch_folder() -> Iterator[Path]:
     from envhub_sandbox.system.folders import CACHE_VARIABLE
 
     try:
-        made = tempfile.TemporaryDirectory(prefix="envhub-doctor-")
+        scratch = tempfile.TemporaryDirectory(prefix="envhub-doctor-")
     except OSError as error:
         raise SandboxUnavailableError(
             f"no folder for temporary files is writable ({error.strerror}); set TMPDIR to one, or "
             "start a read-only container with --tmpfs /tmp"
         ) from error
     before = os.environ.get(CACHE_VARIABLE)
-    with made as folder:
+    with scratch as folder:
         os.chmod(folder, 0o755)  # jails of another user read it
         os.environ[CACHE_VARIABLE] = f"{folder}/cache"
         try:
@@ -202,9 +200,9 @@ def host() -> dict[str, Any]:
 
 def engine() -> dict[str, Any]:
     """The container engine that ``sandbox="docker"`` would use, or why there is none."""
-    module, what = "envhub_sandbox.extras.docker.engines", "a container engine"
+    module = "envhub_sandbox.extras.docker.engines"
     try:
-        container_engine = extras.required(module, "find_engine", what)(None)
+        container_engine = extras.required(module, "find_engine", "a container engine")(None)
     except EnvHubError as error:
         return {"kind": None, "version": None, "rootless": None, "problem": describe(error)}
     facts = {
@@ -274,9 +272,9 @@ def _print(trials: list[Trial], profile: str) -> None:
             "is --sandbox docker; the other way is a Linux host where 'envhub-worker listen' runs, "
             "with --sandbox tcp://HOST:PORT (check it with: envhub doctor tcp://HOST:PORT)."
         )
-    trials = sorted(trials, key=lambda one: one.profile != profile)
+    trials = sorted(trials, key=lambda trial: trial.profile != profile)
     out()
-    bad = {number: "red" for number, one in enumerate(trials, 1) if not one.available}
+    bad = {number: "red" for number, trial in enumerate(trials, 1) if not trial.available}
     show_rows([_PROFILES, *map(_profile, trials)], right=(2,), styles=bad)
     for trial in trials:
         if trial.problem is None and trial.profile == profile:

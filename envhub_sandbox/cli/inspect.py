@@ -82,12 +82,12 @@ def inspect(
     with ProgressBar(quiet=json) as bar, make.explained():
         bar.begin(f"loading {make.ref} in a sandbox")
         with make_env(**arguments) as envs:
-            found = [describe_env(*item) for item in opt.select_envs(envs, suite, task)]
+            described = [describe_env(*item) for item in opt.select_envs(envs, suite, task)]
             provenance = envs.provenance
     if json:
-        print_json({"reference": make.ref, "envs": found, "provenance": provenance})
+        print_json({"reference": make.ref, "envs": described, "provenance": provenance})
     else:
-        _print(found, provenance, in_process=make.in_process)
+        _print(described, provenance, in_process=make.in_process)
 
 
 def describe_env(suite: str, task: Any, env: Any) -> dict[str, Any]:
@@ -109,8 +109,8 @@ def describe_env(suite: str, task: Any, env: Any) -> dict[str, Any]:
     }
 
 
-def _print(found: list[dict[str, Any]], provenance: dict[str, Any], *, in_process: bool) -> None:
-    for env in found:
+def _print(envs: list[dict[str, Any]], provenance: dict[str, Any], *, in_process: bool) -> None:
+    for env in envs:
         title = f"{env['suite']} / {env['task']}"
         out(title if env["spec_id"] is None else f"{title}  ({env['spec_id']})", "bold")
         lines = {

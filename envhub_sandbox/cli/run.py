@@ -91,7 +91,7 @@ def run(
 
     [bold]envhub run ./examples/cartpole --episodes 20 --n-envs 4 --video cartpole.mp4[/bold]
     """
-    with _logged(verbose=verbose, worker_output=make.given["output"]):
+    with _logged(verbose=verbose, worker_output=make.typed["output"]):
         _Run(
             make=make,
             episodes=episodes,
@@ -201,7 +201,7 @@ class _Run:
             return
         document: dict[str, Any] = {
             "reference": self.make.ref,
-            "sandbox": self.make.given["sandbox"],
+            "sandbox": self.make.typed["sandbox"],
             "actions": self.actions,
             "seed": self.seed,
             "episodes": self.episodes,
@@ -231,7 +231,7 @@ class _Run:
         if self.provenance is not None:
             print_provenance(self.provenance, in_process=self.make.in_process)
         out(
-            f"{self.actions} actions, seed {self.seed}, --n-envs {self.make.given['n_envs']}; "
+            f"{self.actions} actions, seed {self.seed}, --n-envs {self.make.typed['n_envs']}; "
             f"first step after {self._time_to_first_step():.2f} s",
             "dim",
         )

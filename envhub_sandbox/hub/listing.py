@@ -338,9 +338,9 @@ def differing(root: Path, mine: Iterable[FileRecord], theirs: Iterable[FileRecor
     return [
         file.path
         for file in mine
-        if (there := listed.get(file.path)) is None
-        or there.size != file.size
-        or digest_of(root / file.path, there.digest.partition(":")[0], file.size) != there.digest
+        if (other := listed.get(file.path)) is None
+        or other.size != file.size
+        or digest_of(root / file.path, other.digest.partition(":")[0], file.size) != other.digest
     ]
 
 

@@ -111,8 +111,7 @@ class HubRef:
     @property
     def is_pinned(self) -> bool:
         """Whether the revision is a full commit, which can never mean anything else."""
-        known = self.repo_type != PYPI and self.revision is not None
-        return known and is_commit(self.revision or "")
+        return self.repo_type != PYPI and is_commit(self.revision or "")
 
     @property
     def meaning(self) -> str:
@@ -145,11 +144,11 @@ def is_of_another_place(text: str) -> bool:
 
 
 def _scheme_of(text: str) -> _Scheme | None:
-    return next((one for one in _SCHEMES if text.lower().startswith(one.starts)), None)
+    return next((item for item in _SCHEMES if text.lower().startswith(item.starts)), None)
 
 
 def _check(parts: Parts) -> None:
-    scheme = next((one for one in _SCHEMES if one.kind == parts.repo_type), None)
+    scheme = next((item for item in _SCHEMES if item.kind == parts.repo_type), None)
     check: Callable[[Parts], None] = scheme.function("check") if scheme else grammar.check
     check(parts)
 

@@ -171,8 +171,8 @@ def _candidates(
     if ref.repo_type == GIT:
         host_of = extras.required("envhub_sandbox.extras.sources.git_commits", "GitHost", str(ref))
         scheme, _, rest = ref.repo_id.partition("://")
-        place, _, name = rest.partition("/")
-        host: RepositoryHost = host_of(f"{scheme}://{place}")
+        address, _, name = rest.partition("/")
+        host: RepositoryHost = host_of(f"{scheme}://{address}")
         return [_Candidate(ref, Repository(GIT, name), host, limits, needs_entry)]
     hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
     every = ("model", "space") if needs_entry else ("model", "dataset", "space")
@@ -213,8 +213,8 @@ def _unavailable(
 def _in_store(candidates: Sequence[_Candidate], even_if_none: bool) -> str:
     """Which commits can be had without the Hub, and how to write them."""
     ref = candidates[0].ref
-    found = [stored for candidate in candidates for stored in store.commits(candidate.folder)]
-    others = [stored for stored in found if stored.commit != ref.revision][:_SHOWN_COMMITS]
+    commits = [stored for candidate in candidates for stored in store.commits(candidate.folder)]
+    others = [stored for stored in commits if stored.commit != ref.revision][:_SHOWN_COMMITS]
     if not others:
         return " No commit of it is in the store to fall back on." if even_if_none else ""
     shown = ", ".join(
@@ -226,17 +226,17 @@ def _in_store(candidates: Sequence[_Candidate], even_if_none: bool) -> str:
 
 
 def with_assets(
-    snapshot: Snapshot, given: Sequence[str], hub: Mapping[str, Any], locked: Sequence[str] = ()
+    snapshot: Snapshot, assets: Sequence[str], hub: Mapping[str, Any], locked: Sequence[str] = ()
 ) -> Snapshot:
     """The snapshot with its assets: see ``extras.sources.assets``. Without that extra a card's are
     not looked for. Raises ``SandboxUnavailableError``: others are asked for.
     """
     module, name = "envhub_sandbox.extras.sources.assets", "with_assets"
-    if given or locked:
+    if assets or locked:
         extras.required(module, name, option_name("assets"))
-    extra = extras.find(module, name)
-    found: Snapshot = snapshot if extra is None else extra(snapshot, given, hub, locked)
-    return found
+    if (extra := extras.find(module, name)) is not None:
+        snapshot = extra(snapshot, assets, hub, locked)
+    return snapshot
 
 
 def local(folder: str | Path, *, allow_secrets: bool = False) -> Snapshot:
@@ -258,14 +258,14 @@ def local(folder: str | Path, *, allow_secrets: bool = False) -> Snapshot:
     from envhub_sandbox.hub.local import copier, split_local  # no pin needs it
 
     named = split_local(str(folder))
-    here, listing = named.listed(allow_secrets=allow_secrets)
+    source, listing = named.listed(allow_secrets=allow_secrets)
     files, path = listing.records, named.path
     if all(file.path != path for file in files):
-        what, advice = here.why_left_out(path) or _missing_entry(path, files)
-        raise RepositoryUnavailableError(f"{here} {what}. {advice}")
-    tell(here.seen(listing), SNAPSHOT)
-    here.warn_of_requirements(listing)
-    copy = copier(listing.files, str(here))
+        lack, advice = source.why_left_out(path) or _missing_entry(path, files)
+        raise RepositoryUnavailableError(f"{source} {lack}. {advice}")
+    tell(source.seen(listing), SNAPSHOT)
+    source.warn_of_requirements(listing)
+    copy = copier(listing.files, str(source))
     snapshot = _by_content(FOLDER, str(named.folder), path, files, copy)
     return replace(snapshot, repo_type=named.repo_type)
 
@@ -338,8 +338,8 @@ class _Candidate:
         if files is None:
             raise SnapshotError(f"{slot.title}: it was removed from the store meanwhile; try again")
         if self.public and not store.is_public(slot) and not self._note_whether_public(slot):
-            what = f"the {self.repo.repo_type} repository is not given without a login"
-            raise HubFailure(Kind.GATED, what, "Only what needs none is taken here")
+            reason = f"the {self.repo.repo_type} repository is not given without a login"
+            raise HubFailure(Kind.GATED, reason, "Only what needs none is taken here")
         return self._finished(slot, files)
 
     def _note_whether_public(self, slot: store.Slot) -> bool:
@@ -382,24 +382,24 @@ class _Candidate:
     def _finished(self, slot: store.Slot, files: tuple[FileRecord, ...]) -> Snapshot:
         listing_within_limits(files, self.limits, slot.title)
         self._require_entry(files)
-        place = slot.commit, self.ref.path, slot.tree, files
-        return Snapshot(self.ref.repo_id, self.repo.repo_type, *place, self.ref.revision)
+        ref, kind = self.ref, self.repo.repo_type
+        return Snapshot(ref.repo_id, kind, slot.commit, ref.path, slot.tree, files, ref.revision)
 
     def _require_entry(self, files: tuple[FileRecord, ...]) -> None:
         if self.needs_entry and all(file.path != self.ref.path for file in files):
-            what, advice = _missing_entry(self.ref.path, files)
-            raise HubFailure(Kind.NO_ENTRY, f"the {self.repo.repo_type} repository {what}", advice)
+            lack, advice = _missing_entry(self.ref.path, files)
+            raise HubFailure(Kind.NO_ENTRY, f"the {self.repo.repo_type} repository {lack}", advice)
 
 
 def _missing_entry(path: str, files: tuple[FileRecord, ...]) -> tuple[str, str]:
     """What to say when a repository lacks the entry file: which ``.py`` files there are."""
     names = [file.path for file in files if file.path.endswith(".py")]
-    what = f"has no file {path!r}"
+    lack = f"has no file {path!r}"
     if not names:
-        return what, "It has no .py file, so it is not an environment"
+        return lack, "It has no .py file, so it is not an environment"
     import difflib
 
     close = difflib.get_close_matches(path, names, n=1) or names
     shown = ", ".join(repr(name) for name in names[:_SHOWN_FILES])
     more = f" and {len(names) - _SHOWN_FILES} more" if len(names) > _SHOWN_FILES else ""
-    return what, f"Name the entry file after a colon, as in ':{close[0]}'; it has {shown}{more}"
+    return lack, f"Name the entry file after a colon, as in ':{close[0]}'; it has {shown}{more}"

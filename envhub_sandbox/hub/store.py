@@ -119,18 +119,18 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
     with contextlib.suppress(FileNotFoundError):  # which is said below
         _refuse_shared_store(slot.tree)
     document, entries = _read_record(slot, text)
-    found = dict(_walk(slot, slot.tree, "")) if os.path.lexists(slot.tree) else {}
+    statuses = dict(_walk(slot, slot.tree, "")) if os.path.lexists(slot.tree) else {}
     recorded = {entry.path for entry in entries}
-    if extra := sorted(found.keys() - recorded):
+    if extra := sorted(statuses.keys() - recorded):
         raise _damaged(slot, f"the file {extra[0]!r} is extra")
     changed = [
         entry
-        for entry, known in entries.items()
-        if (status := found.get(entry.path)) is not None
-        and (folders.others_write(status) or _fingerprint(status) != known)
+        for entry, fingerprint in entries.items()
+        if (status := statuses.get(entry.path)) is not None
+        and (folders.others_write(status) or _fingerprint(status) != fingerprint)
     ]
     _verify_again(slot, changed)
-    if missing := sorted(recorded - found.keys()):
+    if missing := sorted(recorded - statuses.keys()):
         raise _damaged(slot, f"the file {missing[0]!r} is missing", HalfDeletedError)
     if changed:
         with contextlib.suppress(OSError):  # A read-only store only stays slower.
@@ -183,8 +183,8 @@ def _read_record(slot: Slot, text: bytes) -> tuple[dict[str, object], dict[FileR
             raise ValueError(f"unknown format {document['format']!r}")
         rows, programs = document["files"], frozenset(document.get("programs", ()))
         return document, {
-            FileRecord(path, size, digest, path in programs): [size, *known]
-            for path, size, digest, *known in rows
+            FileRecord(path, size, digest, path in programs): [size, *times]
+            for path, size, digest, *times in rows
         }
     except (ValueError, KeyError, TypeError) as error:
         raise _damaged(slot, f"its record.json cannot be read ({error})") from error
@@ -374,16 +374,16 @@ def _mode_of(file: FileRecord) -> int:
 def _fill(
     tree: Path, files: tuple[FileRecord, ...], copy: Callable[[FileRecord, Path], None]
 ) -> None:
-    made = {tree}
+    folders_made = {tree}
     folders.make(tree)
     for file in files:
         target = tree / file.path
-        if target.parent not in made:
+        if target.parent not in folders_made:
             folders.make(target.parent)
-            made.update(p for p in target.parents if tree in p.parents)
+            folders_made.update(p for p in target.parents if tree in p.parents)
         copy(file, target)
         target.chmod(_mode_of(file))
-    for folder in made:
+    for folder in folders_made:
         folder.chmod(_TREE_FOLDER_MODE)
 
 

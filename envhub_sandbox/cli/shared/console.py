@@ -240,7 +240,7 @@ def print_json(document: Mapping[str, Any]) -> None:
     _json_left.set(False)
     text = json.dumps(plain(document), indent=2, allow_nan=False, ensure_ascii=True)
     # what CI systems obey in the middle of a line can only stand in texts, where JSON has escapes
-    text = re.sub(r"#(?=#\w{0,16}\[)|_(?=(?:start|end):)", lambda one: _escaped(one[0]), text)
+    text = re.sub(r"#(?=#\w{0,16}\[)|_(?=(?:start|end):)", lambda match: _escaped(match[0]), text)
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()
 

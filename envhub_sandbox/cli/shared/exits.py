@@ -26,9 +26,9 @@ class Exit(IntEnum):
 
     def __new__(cls, code: int, meaning: str) -> Exit:
         """A code with its meaning."""
-        made = int.__new__(cls, code)
-        made._value_, made.meaning = code, meaning
-        return made
+        member = int.__new__(cls, code)
+        member._value_, member.meaning = code, meaning
+        return member
 
     OK = 0, "done"
     ENVIRONMENT = 1, "the environment raised, or broke the rules"
@@ -47,7 +47,7 @@ class Exit(IntEnum):
     TERMINATED = 143, "terminated"
 
 
-EXIT_CODES = f"Exit codes: {'; '.join(f'{int(one)} {one.meaning}' for one in Exit)}."
+EXIT_CODES = f"Exit codes: {'; '.join(f'{int(code)} {code.meaning}' for code in Exit)}."
 
 
 class UsageError(EnvHubError):
@@ -92,8 +92,8 @@ def describe(error: BaseException) -> str:
         return safe_text(f"a bug in envhub: {type(error).__name__}: {error}")
     text = str(error)
     tail = getattr(error, "log_tail", "")
-    before, found, after = text.rpartition(quoted(tail)) if tail else (text, "", "")
-    if found:
+    before, quote, after = text.rpartition(quoted(tail)) if tail else (text, "", "")
+    if quote:
         kept = tail.rstrip().splitlines()[-_TAIL_LINES:]
         text = before + quoted("\n".join(kept)) + after
     return safe_text(text)

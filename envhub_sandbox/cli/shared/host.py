@@ -79,12 +79,12 @@ def _mounts(mountinfo: Path) -> Iterator[tuple[str, str, Path]]:
     """The version, the group and the folder of each mount of groups that may count memory."""
     for line in _text(mountinfo).splitlines():
         left, _, right = line.partition(" - ")
-        place, what = left.split(" "), right.split(" ")
-        if len(place) < 5 or len(what) < 3:
+        mount, source = left.split(" "), right.split(" ")
+        if len(mount) < 5 or len(source) < 3:
             continue
-        kind = {"cgroup2": _V2, "cgroup": _V1}.get(what[0])
-        if kind == _V2 or (kind == _V1 and _V1 in what[2].split(",")):
-            yield kind, _unescaped(place[3]), Path(_unescaped(place[4]))
+        kind = {"cgroup2": _V2, "cgroup": _V1}.get(source[0])
+        if kind == _V2 or (kind == _V1 and _V1 in source[2].split(",")):
+            yield kind, _unescaped(mount[3]), Path(_unescaped(mount[4]))
 
 
 def _unescaped(word: str) -> str:

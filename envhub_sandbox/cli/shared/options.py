@@ -21,7 +21,7 @@ from envhub_sandbox.settings.options import OPTIONS, json_or_text
 if TYPE_CHECKING:
     from envhub_sandbox.hub.snapshot import Snapshot
 
-ALL = tuple(key for key, one in OPTIONS.items() if one.command)
+ALL = tuple(key for key, option in OPTIONS.items() if option.command)
 """Every option that a command can have, by keys of ``OPTIONS``."""
 _HUB = ("token", "endpoint", "hub_cache_dir")
 SOURCE = (*_HUB, "allow_secrets")
@@ -67,13 +67,13 @@ def with_options(*keys: str, **defaults: Any) -> Callable[[_Command], _Command]:
     These are ``--debug``, and options of ``make_env`` in place of a parameter ``make``, which gets
     ``MakeOptions``. ``defaults`` are those that differ from ``make_env``'s.
     """
-    made = {OPTIONS[key].parameter: _parameter(key, keys, defaults) for key in keys}
+    options = {OPTIONS[key].parameter: _parameter(key, keys, defaults) for key in keys}
 
     def decorate(function: _Command) -> _Command:
         own = inspect.signature(function, eval_str=True).parameters
         shown: dict[str, inspect.Parameter] = {}
-        for name, one in own.items():
-            shown |= made if name == "make" else {name: one}
+        for name, parameter in own.items():
+            shown |= options if name == "make" else {name: parameter}
         shown.setdefault("debug", _keyword("debug", False, Debug))
 
         @functools.wraps(function)
@@ -82,7 +82,7 @@ def with_options(*keys: str, **defaults: Any) -> Callable[[_Command], _Command]:
                 arguments.get("debug", False) if "debug" in own else arguments.pop("debug", False)
             )
             with reported(debug=debug):
-                values = {name: arguments.pop(name) for name in made}
+                values = {name: arguments.pop(name) for name in options}
                 if "make" in own:
                     typed = {key: values[OPTIONS[key].parameter] for key in keys}
                     arguments["make"] = MakeOptions(arguments.get("ref") or "", typed)
@@ -90,9 +90,9 @@ def with_options(*keys: str, **defaults: Any) -> Callable[[_Command], _Command]:
 
         # what typer reads
         vars(command)["__signature__"] = inspect.Signature(
-            [_keyword(one.name, one.default, one.annotation) for one in shown.values()]
+            [_keyword(name, each.default, each.annotation) for name, each in shown.items()]
         )
-        command.__annotations__ = {name: one.annotation for name, one in shown.items()}
+        command.__annotations__ = {name: each.annotation for name, each in shown.items()}
         return command
 
     return decorate
@@ -126,25 +126,26 @@ def _parameter(key: str, others: Sequence[str], defaults: Mapping[str, Any]) -> 
 
 def _completion(metavar: str) -> Callable[[], list[str]] | None:
     """What a shell completes: what a metavar has in small letters."""
-    matches = [re.match(r"[a-z][a-z:/-]*", one) for one in metavar.split("|")]
-    words = [one[0] for one in matches if one is not None]
+    matches = [re.match(r"[a-z][a-z:/-]*", word) for word in metavar.split("|")]
+    words = [match[0] for match in matches if match is not None]
     return (lambda: words) if words else None
 
 
 @dataclass(frozen=True)
 class MakeOptions:
     """What a command line says about ``make_env``.
-    ``given``: the values of the options that the command has, as typed, by keys of ``OPTIONS``.
+    ``typed``: the values of the options that the command has, as typed, by keys of ``OPTIONS``.
     """
 
     ref: str
-    given: Mapping[str, Any]
+    typed: Mapping[str, Any]
 
     def __getitem__(self, key: str) -> Any:
         """An option as ``make_env`` takes it. Raises ``UsageError``: it cannot be read."""
         if key == "sandbox" and self.in_process:
             self._check_trust()
-        return _READERS.get(key, lambda given: given)(self.given[key])
+        reader, value = _READERS.get(key), self.typed[key]
+        return value if reader is None else reader(value)
 
     def snapshot(self, ref: str, *, public: bool = False) -> Snapshot:
         """What a reference names, fetched; see ``fetch`` for ``public``."""
@@ -156,40 +157,40 @@ class MakeOptions:
         """The same, with its assets: those of the command line, or of a lock."""
         from envhub_sandbox.hub.snapshot import with_assets
 
-        return with_assets(self.snapshot(ref), self.given.get("assets") or (), self.hub, locked)
+        return with_assets(self.snapshot(ref), self.typed.get("assets") or (), self.hub, locked)
 
     @property
     def source(self) -> dict[str, Any]:
         """Where a reference is looked for, and how."""
-        return {key: self.given[key] for key in SOURCE}
+        return {key: self.typed[key] for key in SOURCE}
 
     @property
     def hub(self) -> dict[str, Any]:
         """Which Hub, and how."""
-        return {key: self.given[key] for key in _HUB}
+        return {key: self.typed[key] for key in _HUB}
 
     @property
     def in_process(self) -> bool:
         """Whether the repository's code runs in this process."""
-        return bool(self.given["sandbox"] == "none")
+        return bool(self.typed["sandbox"] == "none")
 
     def arguments(self) -> dict[str, Any]:
         """The arguments of ``make_env``. Raises ``UsageError``: an option cannot be read."""
-        made: dict[str, Any] = {"cfg": self.ref, "policy": {}, "limits": {}, "timeouts": {}}
-        for key in self.given:
-            one, value = OPTIONS[key], self[key]
-            if not one.field:
-                made[one.argument] = value
+        arguments: dict[str, Any] = {"cfg": self.ref, "policy": {}, "limits": {}, "timeouts": {}}
+        for key in self.typed:
+            option, value = OPTIONS[key], self[key]
+            if not option.field:
+                arguments[option.argument] = value
             elif value or type(value) in (int, float):  # else the library's default holds
-                made[one.argument][key] = value
-        if limits := made.pop("limits"):
-            made["policy"]["limits"] = limits
-        return made
+                arguments[option.argument][key] = value
+        if limits := arguments.pop("limits"):
+            arguments["policy"]["limits"] = limits
+        return arguments
 
     def _check_trust(self) -> None:
-        if "trust_remote_code" not in self.given:
+        if "trust_remote_code" not in self.typed:
             raise UsageError("this command needs a sandbox; leave out --sandbox none")
-        if not self.given["trust_remote_code"]:
+        if not self.typed["trust_remote_code"]:
             raise UsageError(
                 f"--sandbox none runs the code of {self.ref} in this process, with all your "
                 "permissions. If you trust it, add --trust-remote-code. Otherwise leave out "
@@ -215,15 +216,15 @@ def select_envs(
     """``(suite, task, env)`` for each chosen environment; all where nothing is chosen.
     Raises ``UsageError``: none fits; the text names what there is.
     """
-    found = [(suite, task, env) for suite, group in envs.items() for task, env in group.items()]
+    every = [(suite, task, env) for suite, group in envs.items() for task, env in group.items()]
     chosen = [
         item
-        for item in found
+        for item in every
         if (not suites or str(item[0]) in suites) and (not tasks or str(item[1]) in tasks)
     ]
     if not chosen:
-        names = ", ".join(safe_line(f"{suite}/{task}", 80) for suite, task, _ in found[:_NAMED])
-        more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+        names = ", ".join(safe_line(f"{suite}/{task}", 80) for suite, task, _ in every[:_NAMED])
+        more = f" and {len(every) - _NAMED} more" if len(every) > _NAMED else ""
         raise UsageError(f"no such suite or task; there are (suite/task): {names}{more}")
     return chosen
 

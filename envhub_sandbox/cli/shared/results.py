@@ -150,9 +150,9 @@ def _repository(provenance: dict[str, Any]) -> str:
 def _interpreter(interpreter: dict[str, str], packages: dict[str, str], names: set[str]) -> str:
     from packaging.utils import canonicalize_name
 
-    found = {canonicalize_name(name): release for name, release in packages.items()}
+    installed = {canonicalize_name(name): release for name, release in packages.items()}
     wanted = {canonicalize_name(name) for name in names}
-    shown = [f"{name} {found[name]}" for name in sorted(wanted & found.keys())]
+    shown = [f"{name} {installed[name]}" for name in sorted(wanted & installed.keys())]
     version, executable = interpreter.get("version", ""), interpreter.get("executable", "")
     return ", ".join([f"{version} ({executable})", *shown])
 

@@ -60,7 +60,7 @@ def replay(
 
     sandbox, loaded = make["sandbox"], bundle_reader.load_bundle(bundle)
     given = {
-        name: value for name, value in make.given.items() if name != "sandbox" and value is not None
+        name: value for name, value in make.typed.items() if name != "sandbox" and value is not None
     }
     if not (grant or loaded.is_ours):
         raise UsageError(

@@ -13,7 +13,7 @@ VAGUE = {
     *("asked", "found", "given", "here", "known", "made", "one", "place", "said", "there", "told"),
     *("what", "where", "which", "whole"),
 }
-MOST = 230
+MOST = 95
 
 
 def bound_names(module: ast.Module) -> list[str]:
