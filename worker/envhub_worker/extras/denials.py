@@ -38,9 +38,9 @@ _PRIVATE = re.compile(
     r"|/proc/\d+(/task/\d+)?/(environ|mem|maps|smaps|auxv|io|fd|fdinfo|root|cwd|ns)(/.*)?",
     re.DOTALL,
 )
-"""What is not read by chance; libraries look for a configuration in many another place."""
+"""Private files: reading one is worth a report. Libraries look for settings elsewhere."""
 _DOORS = re.compile(r"/proc/(?:self|thread-self|\d+)(?:/task/\d+)?/(root|cwd|fd/\d+)")
-"""Below a process's own entries one is somewhere else."""
+"""Entries of a process in /proc that lead to another place, like symbolic links."""
 _MOST_STEPS = 128
 _DEEPEST = 16
 """Links are looked at so far below a folder of the jail's own."""
@@ -76,7 +76,7 @@ def asked(
 
 
 def _deed(call: str, words: Sequence[int]) -> tuple[str, bool]:
-    """What it does, and whether it follows a link that stands at the end of a path."""
+    """What a call does, and whether it follows a link at the end of its path."""
     if call in _FLAGS:
         flags = words[_FLAGS[call]]
     elif call in _FLAGS_OF_AT:
@@ -146,8 +146,8 @@ def _absolute(thread: int, base: str, text: bytes, own: OwnPaths, *, last: bool)
 
 
 def _leads(thread: int, path: str, own: OwnPaths, pending: Sequence[str], *, last: bool) -> str:
-    """What stands instead of an entry of a process, or of a link in a folder of its own.
-    Raises ``ValueError``: nothing has a name there, such as below a socket.
+    """The target of an entry of /proc, or of a link in one of the jail's own folders; else empty.
+    Raises ``ValueError``: the entry leads to something without a path, such as a socket.
     """
     door = _DOORS.fullmatch(path)
     if door is not None and pending:
@@ -163,7 +163,7 @@ def _leads(thread: int, path: str, own: OwnPaths, pending: Sequence[str], *, las
 
 
 def _link(thread: int, folder: str, names: Sequence[str]) -> str:
-    """What a link holds; empty where it is none. The kernel is led through no other for that."""
+    """The target of a link; empty if it is none. No other link is followed on the way to it."""
     if len(names) > _DEEPEST:
         return ""
     descriptor = os.open(f"/proc/{thread}/root{folder}", os.O_PATH | os.O_DIRECTORY)

@@ -60,8 +60,9 @@ class Common:
         covered: (files, folders) of /proc to hide.
         landlock_abi: 0 where there is none.
         brokered: Whether init sends the jails' signals.
-        watched: Calls that are permitted and ask init all the same, so that it sees them.
-        programs: The compiled system call filters: where memory is counted, where it is measured.
+        watched: Permitted calls that init is notified of, so that it can record them.
+        programs: The compiled system call filters: one for jails whose memory a control group
+            counts, one for jails whose init measures it.
         set_blas_threads: Sets OpenBLAS's threads, if that is what numpy uses.
     """
 
@@ -83,8 +84,8 @@ class JailContext:
 
     Attributes:
         processes: Cap for ``RLIMIT_NPROC``.
-        measured: No control group counts memory; init measures it.
-        joins: Where to join the jail's control group, if it has one.
+        measured: Init measures memory, because no control group counts it.
+        joins: Descriptors to write to in order to join the jail's control group, if it has one.
     """
 
     init: int
@@ -99,12 +100,12 @@ class JailContext:
 
 @dataclass(frozen=True, kw_only=True)
 class OwnPaths:
-    """What a jail's processes may do by name.
+    """The paths that a jail's processes may use.
 
     Attributes:
         changed: Folders and files that they may change.
         read: Those that they may read.
-        scratch: Folders in which they can have made links.
+        scratch: Folders in which they may have created symbolic links.
     """
 
     changed: tuple[str, ...] = ()

@@ -20,7 +20,7 @@ LEAST_LANDLOCK = {"strict": 1, "no-userns": 3, "container": 0}
 """The Landlock ABI that a profile needs. Without a mount namespace Landlock must itself guard
 truncation, which it does from the third on."""
 LACKS_PACKAGES = 97
-"""The exit code of an interpreter that has not what the worker imports."""
+"""The exit code of an interpreter that lacks packages that the worker imports."""
 Reason = Literal[
     "exit",
     "signal",

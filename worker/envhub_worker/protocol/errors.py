@@ -79,7 +79,7 @@ class UntrustedInput:
     __slots__ = ()
 
     def __enter__(self) -> None:
-        """Nothing: it has to cost nothing."""
+        """Do nothing: a step enters this context several times."""
 
     def __exit__(
         self,

@@ -93,7 +93,7 @@ class Lifecycle:
         return self.state is State.CLOSED
 
     def answered(self) -> None:
-        """No reply is owed any more."""
+        """The reply has come."""
         self.request = None
         if self.state is not State.CLOSED:  # as moved, which a step need not call
             self.on(Event.REPLY)

@@ -56,4 +56,4 @@ MAX_IN_FLIGHT = 16
 """Requests that one runner may owe the answers to. A client sends further steps before the answer
 to the first, and a late answer after a timeout may still be under way."""
 LARGE_BYTES = 64 * KIB
-"""Below this a copy costs less than to keep the owner of the bytes until they are gone."""
+"""Frames below this are copied when they are sent: a copy is cheaper than to keep their owner."""

@@ -30,10 +30,10 @@ class About(NamedTuple):
 
     Attributes:
         names: All of them, in order.
-        positional: Those that may be given in order.
-        defaults: What makes those that need not be given.
-        compared: Those that equality and hash go by.
-        shown: Those of its ``repr``.
+        positional: Those that may be passed by position.
+        defaults: For each optional field, a function that makes its default.
+        compared: Those that ``==`` and ``hash`` use.
+        shown: Those in its ``repr``.
     """
 
     names: tuple[str, ...]
@@ -68,7 +68,7 @@ class FrozenRecord:
 
     __record__: ClassVar[About]
     __order__: ClassVar[tuple[str, ...] | None]
-    """All fields, where all may be given in order."""
+    """All fields, if all may be passed by position; else None."""
 
     def __init__(self, *values: Any, **named: Any) -> None:
         order = self.__order__
@@ -131,7 +131,7 @@ def _default(field: dataclasses.Field[Any]) -> Callable[[], Any] | None:
 
 
 def _completed(record: Any, values: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
-    """All fields in order: those given in order, those given by name, and defaults."""
+    """All fields in order, from positional arguments, keyword arguments and defaults."""
     about: About = record.__record__
     names, defaults = about.names, about.defaults
     given_values = dict(zip(about.positional, values)) | named  # noqa: B905 - seen below

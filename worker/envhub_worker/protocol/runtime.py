@@ -46,8 +46,8 @@ class Runtime(NamedTuple):
 
 
 RECORD = "environment.json"
-"""A file beside a folder of packages. A process that uses these shares its lock, one that
-removes them has it alone. No jail sees it."""
+"""A file beside a folder of packages. A process that uses the packages holds a shared lock on it,
+one that removes them an exclusive one. No jail sees it."""
 
 OWN = Runtime("")
 """The worker server's own interpreter, with its packages."""

@@ -48,7 +48,7 @@ _REFUSED = re.compile(
 
 
 def _values_of(name: str) -> re.Pattern[str] | None:
-    """Which values a zygote may be started with; None if it is with none."""
+    """The values with which a zygote may be started; None if the variable is not such a one."""
     return next((values for names, values in _VALUES.items() if names.fullmatch(name)), None)
 
 
@@ -72,7 +72,9 @@ def why_not(name: str, value: str = "") -> str:
 
 
 def at_start(environment: Mapping[str, str]) -> dict[str, str]:
-    """Those that a zygote is started with. Sets of text have one order in all jails."""
+    """The variables that a zygote is started with. The fixed hash seed makes sets of strings
+    iterate in the same order in all jails.
+    """
     own = {name: value for name, value in environment.items() if _values_of(name) is not None}
     return {HASH_SEED: "0", **own}
 

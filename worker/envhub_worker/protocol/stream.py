@@ -39,7 +39,7 @@ def pack_packet(request_id: int, frames: Sequence[Buffer]) -> list[Buffer]:
 def _whole(
     data: memoryview, limits: WireLimits, check: Callable[[int], None] | None
 ) -> tuple[int, Packet | None]:
-    """The packet that the data begins with and its size, if all of it is there: no copy."""
+    """The size of the first packet and the packet, without a copy; ``(0, None)`` if incomplete."""
     end = _head_bytes(data, limits)
     if data.nbytes < end:
         return 0, None
@@ -61,7 +61,7 @@ def _cut(body: memoryview, lengths: tuple[int, ...]) -> list[Buffer]:
 
 
 def _head_bytes(data: memoryview | bytearray, limits: WireLimits) -> int:
-    """How long the head is that the data begins with, as far as it says so."""
+    """The length of the head at the start of the data, or of its prefix if that is incomplete."""
     if len(data) < _PREFIX.size:
         return _PREFIX.size
     count, request_id = _PREFIX.unpack_from(data)
@@ -97,7 +97,7 @@ def check_lengths(lengths: tuple[int, ...], limits: WireLimits) -> None:
 
 
 def _space(size: int) -> memoryview:
-    """Memory for a body. A length that is declared and never sent costs next to none."""
+    """Memory for a body. Large ones are mapped lazily: a merely declared length costs little."""
     if size <= _SMALL_CHUNK:
         return memoryview(bytearray(size))
     import numpy as np  # which maps large blocks lazily, and which a server may never need

@@ -40,7 +40,7 @@ Handler = Callable[[Asker, Any, Payload], m.Message]
 
 
 class Gate:
-    """Decides what a client may. Nothing is permitted by default: each gate has to say it.
+    """Decides what a client may do. A subclass must say what is permitted.
 
     Attributes:
         handlers: The requests that only this gate knows.
@@ -57,7 +57,7 @@ class Gate:
     witness = Witness()
 
     def begin(self, sessions: Sessions, jails: Jails) -> None:
-        """The server is made."""
+        """The server exists now."""
         self.sessions, self.jails = sessions, jails
 
     def receive(self, router: zmq.Socket[bytes]) -> Incoming:
@@ -76,7 +76,7 @@ class Gate:
         """Set what must be set before the socket is bound."""
 
     def answered(self, asker: Asker, reply: m.Message) -> None:
-        """A request is answered so."""
+        """A request has this answer."""
 
     def tick(self) -> None:
         """A second has passed."""
@@ -86,7 +86,7 @@ class Gate:
         return False
 
     def drained(self) -> bool:
-        """Whether that has been said, and nothing runs any more."""
+        """Whether ``drain`` was called, and nothing runs any more."""
         return False
 
     def close(self) -> None:

@@ -32,13 +32,13 @@ from envhub_worker.supervisor.records import AnsweredError, Asker, RefusedError
 
 _RCVHWM = 64
 _ROUND = 64
+"""Messages that are served before the jails have their turn."""
 _NO_HELLO = (
     "a request before the Hello of its connection: a client that lost its connection, or whose "
     "server was started anew, says Hello on the new one and asks again"
 )
-"""Messages that are served before the jails have their turn."""
 _LAST_WORDS_MS = 500
-"""For how long what was said last is sent on after a drain."""
+"""How long to go on sending the last replies after a drain."""
 
 
 class Server:
@@ -223,7 +223,7 @@ class Server:
         return m.Welcome(m.VERSION, __version__, os.getpid())
 
     def _agree(self, asker: Asker, request: m.Agree) -> None:
-        """Answer before it holds, so that the answer itself can be read."""
+        """Answer first: the reply itself is not compressed yet."""
         possible = compression.available() if self._gate.compresses else ()
         chosen = next((name for name in request.compressions if name in possible), "")
         self.reply(asker, m.Agreement(str(chosen), self._gate.idle_s))

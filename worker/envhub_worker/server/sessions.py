@@ -11,7 +11,7 @@ WATCHER = b"status"
 """The session of a client that only looks: the same each time, and not counted."""
 
 CONNECTIONS_OF_ONE = 4096
-"""Of one session; the longest unused is dropped."""
+"""Most connections of one session; the longest unused one is dropped."""
 
 MAX_HELD = 8192
 """Jails of one session whose last mention is remembered."""
@@ -19,8 +19,8 @@ MAX_HELD = 8192
 
 @dataclass
 class Connection:
-    """One of a session's: its number, by which it is known whether it is still there (None if that
-    is not counted), and the compression that was agreed on.
+    """A connection of a session.
+    ``wire``: its number among the open connections, or None if these are not counted.
     """
 
     wire: int | None = None
@@ -73,7 +73,7 @@ class Sessions:
         return [session for session in self._sessions.values() if session.key == key]
 
     def connect(self, identity: bytes, key: bytes, name: bytes, wire: int | None = None) -> Session:
-        """A connection says which session it belongs to; one that is there is found again."""
+        """Add a connection to the session of this name, which is created if there is none."""
         session = self._sessions.get(key + name)
         if session is None:
             session = self._sessions[key + name] = Session(key, name, self._clock())
@@ -132,13 +132,13 @@ class Sessions:
         session.held = dict([*before, *listed.items()][-MAX_HELD:])
 
     def used(self, identity: bytes, key: bytes, jail: int) -> None:
-        """A connection asks a jail something: its client holds that, whatever it says of it."""
+        """A connection uses a jail: so its client holds it, even if it no longer says so."""
         session = self._of.get((identity, key))
         if session is not None and session.held is not None and jail in session.held:
             session.held[jail] = self._clock()
 
     def unheld(self, session: Session, jail: int, idle_s: float) -> bool:
-        """Whether no client has held a jail for so long; the first answer starts the time."""
+        """Whether the client has held no jail for ``idle_s``; the first call starts the clock."""
         if session.held is None:
             return False
         return self._clock() - session.held.setdefault(jail, self._clock()) > idle_s

@@ -44,7 +44,7 @@ def find_setter() -> Callable[[int], None] | None:
 
 
 def _thread_count(runners: int) -> int:
-    """What OpenBLAS's variables say; else the ``runners`` of a jail share the cores."""
+    """The number in OpenBLAS's variables; else an equal share of the cores for each runner."""
     for name in _VARIABLES:
         value = os.environ.get(name, "")
         if value.isdigit() and int(value) > 0:
@@ -54,7 +54,7 @@ def _thread_count(runners: int) -> int:
 
 @contextmanager
 def threads_at_load(runners: int) -> Iterator[None]:
-    """What OpenBLAS shall read, where a runner itself loads it; nothing of it stays behind."""
+    """Set OpenBLAS's variables while a runner itself loads it, and remove them afterwards."""
     count = str(_thread_count(runners))
     variables = {"OPENBLAS_NUM_THREADS": count, "OPENBLAS_THREAD_TIMEOUT": THREAD_TIMEOUT}
     fresh = {name: value for name, value in variables.items() if name not in os.environ}

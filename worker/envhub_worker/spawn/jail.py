@@ -117,7 +117,7 @@ class Jail:
         close_fds(fds)
 
     def give_up(self) -> None:
-        """Undo the making of a jail that no zygote was asked for."""
+        """Undo the creation of a jail that no zygote was asked for."""
         os.close(self.output)
         close_fds(self.theirs)
         self._channel.close()

@@ -141,7 +141,7 @@ _FEATURES = ("STATE", "VISUAL", "ENV", "ACTION", "REWARD", "LANGUAGE")
 
 
 def install_lerobot_stub() -> None:
-    """Have its names found first: importing LeRobot itself takes seconds of CPU in each jail."""
+    """Put the stub before LeRobot itself, whose import takes seconds of CPU in each jail."""
     sys.meta_path.insert(0, _Stub())
 
 
@@ -197,7 +197,7 @@ class _Stub(MetaPathFinder, Loader):
 
 
 class _AnyOfThisName(ABCMeta):
-    """A class of the stub, which LeRobot's own of that name counts as, too."""
+    """The metaclass of the stub's classes: LeRobot's own classes of the same name are instances."""
 
     def __instancecheck__(cls, instance: Any) -> bool:
         name = (cls.__module__, cls.__qualname__)

@@ -23,7 +23,7 @@ _END_S = 8.0
 
 
 def resolved(runtime: Runtime) -> Runtime:
-    """The same, with the name of its interpreter."""
+    """The runtime with the path of its interpreter filled in."""
     return Runtime(runtime.python or sys.executable, runtime.packages)
 
 
@@ -33,15 +33,15 @@ class ZygoteProcess:
     Args:
         runtime: Its interpreter, and the packages of its jails. Where it has any, it starts without
             ``site``, and so sees none: not those, and not the interpreter's own.
-        ahead: Import before the configuration comes, and so before any confinement: only where that
-            is from what the server has imported the same from.
+        ahead: Import before the configuration comes, and so before any confinement. Only done with
+            the server's own interpreter, whose packages the server itself has imported.
         granted: The variables of its jails.
 
     Attributes:
         environment: What it was executed with.
         channel: Its first message is the configuration.
         folder: Removed by ``Spawner.close``.
-        pid: Of what was started, which may only wait for the zygote.
+        pid: Of the process that was started; under namespaces it only waits for the zygote.
     """
 
     def __init__(

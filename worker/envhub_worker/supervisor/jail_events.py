@@ -70,7 +70,7 @@ class JailEvents:
         self._loop.watch(fd, self._guarded(entry, callback))
 
     def _guarded(self, entry: JailRecord, callback: Callable[[], None]) -> Callable[[], None]:
-        """Whatever goes wrong with a jail is its own end, and not the server's."""
+        """A callback whose exceptions end the jail, and not the server."""
 
         def guarded() -> None:
             try:
@@ -83,7 +83,7 @@ class JailEvents:
         return guarded
 
     def share(self, link: RunnerLink, slabs: ServedSlabs) -> None:
-        """The server takes a runner's steps, by these slabs."""
+        """From now on the server steps a runner by these slabs."""
         self._part_with(link)
         link.slabs = slabs
         self._steps.add(slabs)
@@ -101,7 +101,7 @@ class JailEvents:
         self._steps.owe(link.slabs, self._guarded(entry, partial(self._stepped, entry, link)))
 
     def _stepped(self, entry: JailRecord, link: RunnerLink) -> None:
-        """A runner has answered; nobody may wait for that any more."""
+        """Take a runner's answer to a step, if there is one. Its request may be gone by now."""
         if link.slabs is None or link.slabs.owner is None or not link.slabs.answered:
             return
         (pending, index), frames = link.slabs.take()
@@ -200,7 +200,7 @@ class JailEvents:
         self._runner_died(entry, self._judged(entry, death))
 
     def _judged(self, entry: JailRecord, death: m.Death) -> m.Death:
-        """A kill is the kernel's, where it has counted one for the memory around all of us."""
+        """Report a SIGKILL as out-of-memory if the kernel counted it for the server's own limit."""
         by_signal = death.signal == "SIGKILL" and death.reason in ("signal", "exit")
         if entry.death is None and by_signal and self._outer_limit.killed_one():
             return m.replace(death, reason="out-of-memory", detail=OUTER_LIMIT)
@@ -215,7 +215,7 @@ class JailEvents:
         self._outer_limit.close()
 
     def _runner_died(self, entry: JailRecord, death: m.Death) -> None:
-        """The end of its jail too, unless that is kept."""
+        """End the jail too, unless it is kept."""
         if not entry.kept:
             self.end(entry, death)
         elif entry.death is None and death.runner in entry.links:
@@ -290,7 +290,7 @@ class JailEvents:
         entry.jail.kill()
 
     def _unwatch_control(self, entry: JailRecord) -> None:
-        """Once: after that the number may be another's."""
+        """Only once: afterwards the descriptor's number may belong to another file."""
         self._loop.unwatch(entry.control)
         entry.control = -1
 

@@ -58,12 +58,13 @@ MAX_JAILS = 256
 MAX_SERVED_OUTPUT = 1 << 20
 """Bytes of what a jail prints that are kept for a client on another host."""
 MAX_LOST = 4096
-"""Runners of a kept jail that may die: their deaths are remembered."""
+"""Most dead runners of a kept jail: each death is remembered."""
 MAX_IDLE_ZYGOTES = 2
-"""Without a jail, when another is started. A client mostly has one policy, or two in turns."""
+"""Most zygotes without jails that are kept when another is started. Most clients have one or two
+policies."""
 MAX_REMOTE_ZYGOTES = 16
-"""That the open jails of one client on another host need: each is an interpreter, in no jail's
-limit of memory. Clients of this host are its user."""
+"""Most zygotes of one client on another host: each is an interpreter that no jail's memory limit
+counts. Clients on this host are its own user."""
 _OF_POLICY = ("profile", "network", "readable", "gpu", "record_denials")
 
 _Zygote = tuple[Any, ...]  # its name: a runtime, variables, and these parts of a policy
@@ -175,12 +176,12 @@ class Jails:
             )
 
     def _wire_limits(self, entry: JailRecord) -> WireLimits:
-        """What its client permits; where that is somebody on another host, no more than ours."""
+        """The limits that the client chose; for a client on another host at most our own."""
         most = entry.jail.spec.confinement.limits.message_bytes
         return limits_for(most if self._local else min(most, DEFAULT_LIMITS.message_bytes))
 
     def _output_bytes(self, confinement: Confinement) -> int:
-        """As ``_wire_limits``: the server itself keeps them."""
+        """Likewise for output, which the server keeps in its own memory."""
         most = confinement.limits.output_bytes
         return most if self._local else min(most, MAX_SERVED_OUTPUT)
 
@@ -404,7 +405,7 @@ def _held(entry: JailRecord, children: Children | None) -> dict[str, object]:
 
 
 def _note_limits(entry: JailRecord, usage: dict[str, int]) -> None:
-    """What a jail has used up it is denied; in front, where no flood of attempts hides it."""
+    """List used up limits as denials, in front, where a flood of others cannot hide them."""
     confinement = entry.jail.spec.confinement
     runners, own_root = entry.jail.runner_pids(), confinement.profile == "strict"
     limits = set(reached(confinement.limits, usage, runners, own_root=own_root))
@@ -416,7 +417,7 @@ def _note_limits(entry: JailRecord, usage: dict[str, int]) -> None:
 
 
 def _can_step(link: RunnerLink | None, frames: list[bytes]) -> bool:
-    """Whether a runner can be asked that; one that has died is answered for."""
+    """Whether a runner can be asked to step. A dead one can: its death is the answer."""
     if link is None:
         return True
     slabs = link.slabs

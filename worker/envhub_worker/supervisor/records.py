@@ -27,7 +27,7 @@ from envhub_worker.supervisor.runner_stream import RunnerLink
 
 _CHUNK = 1 << 16
 MAX_BYTES = 1 << 20
-"""What one reply tells at most."""
+"""Most bytes of output in one reply."""
 
 
 class OutputTail:
@@ -61,14 +61,14 @@ class OutputTail:
             del self._kept[: -self._limit]
 
     def since(self, offset: int) -> tuple[int, bytes]:
-        """What came from this byte on, and where that begins: later, if it is not kept any more."""
+        """Where the kept output from ``offset`` on begins, and the output itself."""
         first = self._total - len(self._kept)
         start = min(max(offset, first), self._total)
         return start, bytes(self._kept[start - first : start - first + MAX_BYTES])
 
     def text(self, lines: int = 40) -> str:
-        """The last lines, fit for a terminal. Of one that is cut off no end is told: a client looks
-        for whole secrets in it.
+        """The last lines, fit for a terminal, without a first line that is cut off: a client
+        searches them for secrets, and would not recognise half of one.
         """
         kept = bytes(self._kept[-self._limit :])
         if len(kept) < self._total:
@@ -97,7 +97,7 @@ class IdleTimer:
         self.begin()
 
     def begin(self) -> None:
-        """Something was asked, or answered."""
+        """Restart the clock: something was asked, or answered."""
         self._since = monotonic()
 
     def watch(self, runner: int, fds: Sequence[int]) -> None:
@@ -121,7 +121,7 @@ class IdleTimer:
             self.forget(runner)
 
     def passed(self, busy: bool) -> bool:
-        """Whether it was too long; ``busy``: some runner owes an answer to a message."""
+        """Whether the limit has passed. ``busy``: a runner has a message to answer."""
         pairs = [pair for pairs in self._slabs.values() for pair in pairs]
         sequences = [_sequence(request) for request, _ in pairs]
         answered = [_sequence(reply) for _, reply in pairs]
@@ -196,7 +196,7 @@ class Pending:
     since: float = field(default_factory=monotonic)
 
     def lost(self, index: int, death: m.Death) -> None:
-        """In the place of a runner's answer: how it died."""
+        """Record a runner's death in the place of its answer."""
         self.dead.add(index)
         self.replies[index] = m.pack(m.replace(death, operation=self.operation))
 
@@ -235,7 +235,7 @@ class JailRecord:
         self.control = self.jail.fileno()
 
     def bytes_moved(self) -> tuple[int, int]:
-        """To its runners, and from them."""
+        """Bytes sent to its runners, and bytes received from them."""
         sent, received = self.moved
         links = self.links.values()
         return sent + sum(link.sent for link in links), received + sum(
@@ -243,19 +243,19 @@ class JailRecord:
         )
 
     def shared_bytes(self, but: Collection[object] = ()) -> int:
-        """Of the slabs that the server shares with its runners, but for those of some."""
+        """Size of the slabs that the server shares with its runners, except those in ``but``."""
         others = (link.slabs for runner, link in self.links.items() if runner not in but)
         return sum(slabs.shared_bytes for slabs in others if slabs is not None)
 
     def drop(self, runner: int) -> RunnerLink:
-        """Its link to a runner, which it has no more."""
+        """Remove and return the link to a runner; its byte counts are kept."""
         link = self.links[runner]
         self.moved = self.moved[0] + link.sent, self.moved[1] + link.received
         return self.links.pop(runner)
 
 
 def waiting(entry: JailRecord) -> list[Pending]:
-    """Everything that runners owe an answer to; they owe it no more."""
+    """The requests that runners have not answered; clears them."""
     states = {}
     for link in entry.links.values():
         for pending, _ in link.owed:
@@ -265,7 +265,7 @@ def waiting(entry: JailRecord) -> list[Pending]:
 
 
 def owes(entry: JailRecord, runner: int) -> int:
-    """How many answers a runner owes; one that has died owes none any more."""
+    """How many requests a runner has not answered; 0 for one that has died."""
     link = entry.links.get(runner)
     return 0 if link is None else len(link.owed)
 

@@ -18,7 +18,7 @@ from envhub_worker.protocol.confinement import Limits
 _AT_ONCE = 64
 _A_SECOND = 16
 _LEFT_BYTES = 1 << 16
-"""Below that a scratch is full: it is counted in pages, and for each core."""
+"""A scratch with less counts as full: the kernel counts pages, and keeps some per core."""
 
 
 class CountLimit:

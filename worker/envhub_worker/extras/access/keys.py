@@ -88,9 +88,9 @@ class AuthorizedClients:
         self.refresh()
 
     def refresh(self) -> bool:
-        """Read the file if it has changed; whether it was read.
-        Raises ``OSError``: it cannot be read; ``ValueError``: a line of it is none, or there are
-        too many; the text says which, and is the same until it changes again.
+        """Read the file if it has changed; returns whether it was read.
+        Raises ``OSError``: it cannot be read; ``ValueError``: a line is malformed, or there are too
+        many clients. The text is the same until the file changes again.
         """
         if self._path is None:
             return False

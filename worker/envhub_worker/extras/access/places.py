@@ -25,9 +25,9 @@ _PATIENCE_S = 5.0
 _MAX_WAITING = 1024
 _PLACE_NEEDED = "its client is gone, and its key needed the place"
 _FORGOTTEN_S = 3600.0
-"""Where silent clients keep their jails, those without any are forgotten after so long."""
+"""Where ``idle_s`` is 0, a silent client without jails is forgotten after so long."""
 _QUIET_S = 1.0
-"""Between the end of the last jail and the server's own: its client learns why from this one."""
+"""How long a draining server waits after its last jail, so that its client can ask why it ended."""
 
 
 @dataclass
@@ -58,7 +58,7 @@ class Line:
         )
 
     def ahead(self, key: bytes, owner: bytes) -> int:
-        """How many wait that have come before."""
+        """How many clients that wait came before this one."""
         waiting, now = self._waiting.get(key, OrderedDict()), self._clock()
         for name, client in list(waiting.items()):
             if now - client.asked > _PATIENCE_S:
@@ -71,7 +71,7 @@ class Line:
         return before
 
     def wait(self, key: bytes, owner: bytes) -> None:
-        """A client is to ask again."""
+        """Note that a client was told to ask again."""
         waiting = self._waiting.setdefault(key, OrderedDict())
         client = waiting.get(owner)
         if client is not None:
@@ -80,7 +80,7 @@ class Line:
             waiting[owner] = _Waiting(self._clock())
 
     def leave(self, key: bytes, owner: bytes) -> None:
-        """A client has been let in."""
+        """Remove a client that was let in."""
         waiting = self._waiting.get(key, OrderedDict())
         waiting.pop(owner, None)
         if not waiting:
@@ -88,7 +88,7 @@ class Line:
 
 
 class Places:
-    """Finds a place, or raises ``BusyError``, and ends what has no right to one any more.
+    """Holds sessions and jails against the quotas, and ends those that clients have left.
 
     Args:
         idle_s: How long the jails of a client that says nothing live on; 0 for ever.
@@ -114,7 +114,7 @@ class Places:
         self.lines = {"sessions": Line(), "jails": Line()}
 
     def for_session(self, key: bytes, name: bytes) -> None:
-        """Hold a session against the quota."""
+        """Raise ``BusyError`` if a key has too many sessions."""
         of_key = self._sessions.of_key(key)
         others = [session for session in of_key if session.name not in (name, WATCHER)]
         quota = self._quotas.sessions
@@ -132,7 +132,7 @@ class Places:
         self.lines["sessions"].leave(key, name)
 
     def for_jail(self, asker: Asker, more: Use) -> None:
-        """Hold a jail, or further runners of one, against the quotas."""
+        """Raise ``BusyError`` if a jail, or further runners of one, would be over the quotas."""
         key = asker.key
         check_jail((), more, self._quotas)  # no session ends for what never fits
         while True:
@@ -175,7 +175,7 @@ class Places:
         ]
 
     def _refuse_behind(self, quota: str, key: bytes, owner: bytes, used: int, limit: int) -> None:
-        """There is room, and others of the same key have waited for it."""
+        """Raise ``BusyError`` if others of the same key have waited longer for the room."""
         line = self.lines[quota]
         ahead = line.ahead(key, owner)
         if ahead:

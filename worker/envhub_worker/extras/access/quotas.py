@@ -17,7 +17,7 @@ from envhub_worker.supervisor.records import Asker, RefusedError
 
 MAX_CONNECTIONS = 1024
 RETRY_S = 1.0
-"""When to ask again. A client that does not keeps no other waiting."""
+"""How soon a refused client should ask again. One that does not ask again loses its turn."""
 
 
 class BusyError(RefusedError):
@@ -184,7 +184,7 @@ class InFlight:
         self._requests[asker.identity, asker.request_id] = asker, key, size
 
     def answered(self, asker: Asker) -> None:
-        """A request was answered: this very one, not another under the same id."""
+        """Stop counting a request. Another one may have used the same id before."""
         request = (asker.identity, asker.request_id)
         counted, key, size = self._requests.get(request, (None, b"", 0))
         if counted is not asker:

@@ -68,7 +68,7 @@ class RemoteGate(Gate):
         }
 
     def begin(self, sessions: Sessions, jails: Jails) -> None:
-        """Clients find their places among these."""
+        """Set up the places for sessions and jails."""
         super().begin(sessions, jails)
         rules, wires = self._rules, self._open_wires
         self._places = Places(
@@ -223,7 +223,7 @@ class RemoteGate(Gate):
         return client_name(self._rules.authorized.name_of(key), self._rules.keys is None)
 
     def figures(self, key: bytes | None = None) -> dict[str, Any]:
-        """What the server has to report: all for an operator, for any other key its own share."""
+        """Figures of the server: all of them for an operator, else those of the key alone."""
         clients = ClientFigures()
         sessions = [session for session in self.sessions.all() if session.name != WATCHER]
         watchers = [session for session in self.sessions.all() if session.name == WATCHER]
@@ -295,7 +295,7 @@ class RemoteGate(Gate):
                 self.jails.end(entry, why)
 
     def _read_clients(self) -> None:
-        """Once a second; what is wrong with the list is said once, until it is another."""
+        """Read the list of clients if it has changed; log each problem once."""
         try:
             changed, why = self._rules.authorized.refresh(), ""
         except (OSError, ValueError) as error:
@@ -324,5 +324,5 @@ class RemoteGate(Gate):
 
 
 def _key_of(entry: JailRecord) -> bytes:
-    """Whose a jail is: what it is marked with begins with the key, see ``Session.owner``."""
+    """The key of the client that owns a jail: ``Session.owner`` begins with it."""
     return entry.session[:KEY_BYTES]

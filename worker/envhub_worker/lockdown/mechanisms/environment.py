@@ -10,7 +10,7 @@ from envhub_worker.protocol.start_variables import HASH_SEED
 _PATH = "/usr/local/bin:/usr/bin:/bin:/usr/local/sbin:/usr/sbin:/sbin"
 _INHERITED = ("LANG", "LC_ALL", "LC_CTYPE", "TZ")
 _KEPT = ("PATH", HASH_SEED, *_INHERITED)
-"""What a jail, and an interpreter that is started in it, has of its zygote's."""
+"""Variables that a jail, and an interpreter started in it, keeps of its zygote's."""
 
 THREAD_TIMEOUT = "20"
 """For OpenBLAS, which reads it once: in cycles, a power of two. By default a runner's threads would

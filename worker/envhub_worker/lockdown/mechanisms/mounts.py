@@ -176,9 +176,9 @@ class View(NamedTuple):
 
 
 def mount_skeleton(packages: str) -> None:
-    """The folders of ``packages`` once more, as the jails' own, for ``mount_jail`` of each jail.
+    """Mirror the folders of ``packages``, owned by the jails' user, for each jail's overlay.
 
-    The shared folders are read-only and perhaps another user's, and so they would be in a view.
+    Without them the folders in an overlay would be read-only or another user's, as the shared ones.
     """
     kernel.mount("skeleton", _SKELETON, "tmpfs", _PLAIN, "mode=755")
     _mirror_folders(packages, f"{_SKELETON}/packages")
@@ -233,7 +233,7 @@ def _mount_scratch(size: int, inodes: int) -> None:
 
 
 def _mount_terminals() -> None:
-    """An instance of the jail's own, whose terminals nobody else sees; else there are none."""
+    """Mount the jail's own devpts, whose terminals nobody else sees, if the host permits it."""
     with contextlib.suppress(OSError):
         options = f"newinstance,ptmxmode=666,mode=600,max={_MAX_TERMINALS}"
         flags = kernel.MS_NOSUID | kernel.MS_NOEXEC
@@ -289,10 +289,9 @@ def _mount_links(snapshot: str) -> None:
 
 
 def _mirror_folders(source: str, target: str) -> None:
-    """What is shared is read-only, and perhaps another user's: in a view folders are the jail's.
+    """Make the folders of ``source`` again in ``target``, so that they belong to the jail's user.
 
-    Without recursion, as ``os.walk`` has it before Python 3.12: of a package, a stranger chose how
-    deep it is.
+    Without recursion, which ``os.walk`` uses before Python 3.12: a stranger chose the depth.
     """
     waiting = [""]
     while waiting:

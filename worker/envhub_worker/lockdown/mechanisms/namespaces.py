@@ -102,10 +102,10 @@ def fork_in_new_pid_namespace() -> int:
 
 
 def forbid_what_is_counted() -> None:
-    """Let no process below ours make a namespace or watch a file, should the filter let it by.
+    """Set the kernel's limits on namespaces and file watches to 0 here, as a second barrier.
 
-    The kernel counts these for each user, in each user namespace and all above it; so the user's
-    other programs keep their share.
+    The kernel counts them per user in each user namespace and all above it, so a jail would take
+    them from the user's other programs.
     """
     for name in os.listdir("/proc/sys/user"):
         _write(f"/proc/sys/user/{name}", "0")

@@ -84,7 +84,7 @@ _MODES_AND_TIMES = "chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat
 _NAMESPACED = f"""
     {_MODES_AND_TIMES} sched_setaffinity removexattr lremovexattr fremovexattr
 """
-#: As of a file system without attributes. Access lists are memory of the kernel's own, 128 KiB a
+#: These answer as on a file system without attributes. Access lists are kernel memory, 128 KiB a
 #: file, that no control group counts; programs that copy a file go on without them.
 WITHOUT_ATTRIBUTES = frozenset(("setxattr", "lsetxattr", "fsetxattr"))
 # These succeed and do nothing: a jail has one user, libzmq aborts if it cannot set the scheduler,

@@ -36,15 +36,16 @@ def is_another_target(call: str, arguments: Sequence[int], caller: int, init: in
 
 
 def never_a_target(path: str) -> bool:
-    """Whether a path is below the entry of a process that the jail cannot have met."""
+    """Whether a path is below ``/proc/N`` of a process that the jail cannot have met."""
     entry = _ENTRY.fullmatch(path)
     return entry is not None and _never_was(int(entry[1]))
 
 
 def _never_was(number: int) -> bool:
-    """Whether a jail's own namespace has not yet come to that number, or no other can.
+    """Whether no process can have had this number.
 
-    A host begins again at low numbers, and a jail hardly ever lives that long.
+    In a pid namespace of the jail's own: it is above the last number given out there. On the host,
+    where numbers begin again at low ones: it is above the largest possible one.
     """
     is_ours = os.getpid() == _FIRST
     most = procfs.text("/proc/loadavg" if is_ours else "/proc/sys/kernel/pid_max")

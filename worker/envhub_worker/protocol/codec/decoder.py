@@ -35,7 +35,7 @@ _FEW_KEYS = 64
 _MAX_SAME_HASH = 16
 _DESCRIBED = frozenset({RemoteObject, RemoteEnum})
 _LOSSY = _DESCRIBED | {tuple, frozenset, slice}
-"""Classes that keys of different objects arrive as, or that Python cannot hash; arrays too."""
+"""Keys that arrive as these may be equal although the peer's were not, or be unhashable."""
 
 
 class _Head:
@@ -199,7 +199,7 @@ def _owned(value: Any) -> Any:
 
 
 def _distinct(keys: list[Any]) -> list[Any]:
-    """The same keys, but those that cannot be told apart or hashed here are described.
+    """The keys, with a numbered ``RemoteObject`` for each that is unhashable or a duplicate here.
 
     In the worker they were different objects: two with the same ``repr``, or a tensor.
     """

@@ -32,7 +32,7 @@ from envhub_worker.protocol.limits import WireLimits
 _DEPTH = 16
 """Containers in containers; a message's own count towards the wire's limit, too."""
 _FEW = 64
-"""Keys that are no text, and elements of a set: the receiver counts those of larger ones."""
+"""Keys that are not text, or elements of a set. Above this the receiver counts their hashes."""
 _MOST_ARRAYS = 1024
 """Each may become a frame."""
 _ATOMS = frozenset({type(None), bool, float, complex})
@@ -259,9 +259,9 @@ _PLAIN = frozenset({bool, float, type(None)})
 _SHORT = 64
 """Characters of a text, bits of an integer, that need no trial."""
 _AROUND = 2
-"""Containers: the message, and a description, which is one itself."""
+"""Containers that the message itself and a ``RemoteObject`` in it add to the depth."""
 _SPARE = 64
-"""Items for what stands around the value in a message."""
+"""Items that are kept free for the rest of the message."""
 
 
 def reduced(message: list[Any], send: Send, limits: WireLimits) -> list[Any]:

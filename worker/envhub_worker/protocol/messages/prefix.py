@@ -116,4 +116,4 @@ def _attribute(value: object) -> Attribute:
 WARNINGS = Prefix(Warnings, 4 * (MAX_CATEGORY + MAX_TEXT), _warning)
 """What the repository has warned of."""
 CHANGES = Prefix(Changes, 4 * MAX_ATTRIBUTE, _attribute)
-"""Attributes that have another value than the client was last given. They are watched no more."""
+"""Attributes whose value has changed since the client read it. They are no longer watched."""

@@ -143,7 +143,7 @@ class Misfit(RemoteProtocolError):
 
 
 APART: dict[Any, Any] = {None: None}
-"""What a shard says in place of infos that it cannot join without knowing the other shards'."""
+"""Sent by a shard whose infos can be joined only together with those of the other shards."""
 
 
 def is_apart(infos: dict[Any, Any]) -> bool:
@@ -152,11 +152,11 @@ def is_apart(infos: dict[Any, Any]) -> bool:
 
 
 APART_SCALARS = -1
-"""The key, in infos of the only sub-environment that are not joined, of what ``integers`` says."""
+"""The key of the result of ``integers``, in the unjoined infos of a single sub-environment."""
 
 
 APART_REWARD = -2
-"""Likewise of a tuple with its reward, where that is no number: an agent's each, for instance."""
+"""Likewise of a tuple with its reward, if that is not a number: a dict of agents, for example."""
 
 
 def reward_misfit(reward: Any, index: int, shape: tuple[int, ...] = ()) -> str:
@@ -197,7 +197,7 @@ def integers(space: gym.Space[Any], member: Any) -> list[bool]:
 
 
 def with_integers(space: gym.Space[Any], member: Any, which: Iterator[bool]) -> Any:
-    """The member with those for which the next of ``which`` is true; the other way round."""
+    """The inverse of ``integers``: makes a discrete member a Python integer as ``which`` says."""
 
     def restored(space: gym.Space[Any], member: Any) -> Any:
         return int(member) if isinstance(space, spaces.Discrete) and next(which, False) else member
@@ -540,7 +540,7 @@ def _restored(space: gym.Space[Any], batch: Any) -> Any:
 
 
 def restore(space: Any, member: Any) -> Any:
-    """One member with the class that Gymnasium gives it; what does not fit the space as it is."""
+    """One member with the class that Gymnasium gives it. What does not fit stays as is."""
     if isinstance(space, spaces.Dict) and isinstance(member, dict):
         subspaces = space.spaces
         return {

@@ -22,7 +22,7 @@ from envhub_worker.protocol.records import dataclass
 from envhub_worker.supervisor.records import RefusedError
 
 BLOCK_BYTES = 4096
-"""What the smallest file and each entry of a tree are charged: they take disk, too."""
+"""Charged for the smallest file and for each entry of a tree."""
 SHARED = "shared"
 """What stands for a client's key, where all clients are one user's."""
 
@@ -82,9 +82,9 @@ class BlobStore:
         return all(_is_there(self.tree(digest) / file.path, file.size) for file in files)
 
     def set_aside(self, digest: str) -> None:
-        """Make room for a tree of which somebody has deleted a part.
+        """Move a damaged tree away, so that it can be built again.
 
-        What is left of it stays until the next start: a jail may have it open.
+        It is removed at the next start: a jail may have it open.
         """
         tree = self.tree(digest)
         aside = tempfile.mkdtemp(prefix=".building-", dir=tree.parent)
