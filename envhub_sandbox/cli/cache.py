@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
@@ -90,7 +91,8 @@ def stored_snapshots() -> list[StoredSnapshot]:
     snapshots = [_read(record) for record in records]
     return sorted(
         (snapshot for snapshot in snapshots if snapshot is not None),
-        key=lambda snapshot: -snapshot.used,
+        key=attrgetter("used"),
+        reverse=True,
     )
 
 

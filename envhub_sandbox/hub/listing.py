@@ -15,6 +15,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import field, fields
+from operator import attrgetter
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Protocol, TypeVar
 
@@ -170,7 +171,7 @@ class Snapshot:
 
     def known_as(self, path: str) -> str | None:
         """A file as its author knows it, for tracebacks; None if there is none of that name."""
-        index = bisect_left(self.files, path, key=lambda file: file.path)
+        index = bisect_left(self.files, path, key=attrgetter("path"))
         if index == len(self.files) or self.files[index].path != path:
             return None
         if self.is_local:
@@ -238,7 +239,7 @@ def listing_within_limits(
             raise _too_large(title, "it has too many files", "max_files", limits.max_files)
         if total > limits.max_bytes:
             raise _too_large(title, "its files are too large", "max_bytes", limits.max_bytes)
-    return tuple(sorted(taken, key=lambda file: file.path))
+    return tuple(sorted(taken, key=attrgetter("path")))
 
 
 def _too_large(title: str, excess: str, name: str, limit: int) -> SnapshotTooLargeError:

@@ -19,6 +19,7 @@ import posixpath
 import stat
 import warnings
 from collections.abc import Callable, Collection, Iterator
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -342,9 +343,7 @@ class LocalFolder:
         if prefix.count("/") >= MAX_DEPTH:
             raise SnapshotError(f"{self}: {prefix!r} is over {MAX_DEPTH} folders deep")
         with os.scandir(folder) as listing:
-            return sorted(
-                (item for item in listing if item.name != _GIT), key=lambda item: item.name
-            )
+            return sorted((item for item in listing if item.name != _GIT), key=attrgetter("name"))
 
     def _inside(self, path: Path, name: str) -> Path:
         if not path.is_symlink():

@@ -23,6 +23,7 @@ import stat
 import tempfile
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -415,4 +416,4 @@ def commits(folder: Path) -> list[StoredCommit]:
             document = json.loads(record.read_bytes())
             revision, fetched = document.get("revision"), document.get("fetched", "")
             commits.append(StoredCommit(record.parent.name, revision, str(fetched)))
-    return sorted(commits, key=lambda stored: stored.fetched, reverse=True)
+    return sorted(commits, key=attrgetter("fetched"), reverse=True)

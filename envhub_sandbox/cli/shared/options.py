@@ -45,13 +45,13 @@ Task = Annotated[
     list[str] | None,
     typer.Option("--task", help="Only this task id (repeatable).", rich_help_panel=_PANEL),
 ]
-SEVERITIES = ("error", "warning", "note")
+SEVERITIES = ["error", "warning", "note"]
 FailOn = Annotated[
     str | None,
     typer.Option(
         "--fail-on",
         metavar="|".join(SEVERITIES),
-        autocompletion=lambda: list(SEVERITIES),
+        autocompletion=SEVERITIES.copy,
         help="Exit with 1 for findings of this severity or a worse one.",
     ),
 ]
@@ -128,7 +128,7 @@ def _completion(metavar: str) -> Callable[[], list[str]] | None:
     """What a shell completes: what a metavar has in small letters."""
     matches = [re.match(r"[a-z][a-z:/-]*", word) for word in metavar.split("|")]
     words = [match[0] for match in matches if match is not None]
-    return (lambda: words) if words else None
+    return words.copy if words else None
 
 
 @dataclass(frozen=True)
@@ -244,12 +244,12 @@ def is_typed(context: typer.Context, name: str) -> bool:
     return source is not None and source.name == "COMMANDLINE"
 
 
-def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
+def read_env_kwargs(texts: Sequence[str] | None) -> dict[str, Any]:
     """Keyword arguments from JSON objects and ``key=value`` pairs; later ones win.
     Raises ``UsageError``: one is neither.
     """
     values: dict[str, Any] = {}
-    for text in texts:
+    for text in texts or ():
         if text.lstrip().startswith("{"):
             values |= _json_object("--env-kwargs", text)
             continue
@@ -271,13 +271,19 @@ def _json_object(option: str, text: str) -> dict[str, Any]:
     return value
 
 
+def _read_dependencies(text: str) -> Any:
+    return _json_object("--dependencies", text) if text.lstrip().startswith("{") else text
+
+
+def _none_for(word: str, name: str) -> str | None:
+    return None if name == word else name
+
+
 _READERS: dict[str, Callable[[Any], Any]] = {
-    "sandbox": lambda name: None if name == "none" else name,
-    "env_kwargs": lambda texts: read_env_kwargs(texts or ()),
-    "dependencies": lambda text: (
-        _json_object("--dependencies", text) if text.lstrip().startswith("{") else text
-    ),
-    "output": lambda name: None if name == "-" else name,  # the log of run
+    "sandbox": functools.partial(_none_for, "none"),
+    "env_kwargs": read_env_kwargs,
+    "dependencies": _read_dependencies,
+    "output": functools.partial(_none_for, "-"),  # the log of run
     "gpu": read_gpu,
 }
 """How values are made of what was typed, where the two are not the same."""

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from time import monotonic
 
@@ -260,7 +261,7 @@ class Placement:
 
 def _all_together(each: Iterable[Runtime]) -> Runtime:
     """One that stands for all: that of places that are alike, or else a name of them together."""
-    runtimes = sorted(set(each), key=lambda runtime: (runtime.python, runtime.packages))
+    runtimes = sorted(set(each), key=attrgetter("python", "packages"))
     if len(runtimes) == 1:
         return runtimes[0]
     # it is looked up as a path, which thousands of addresses are too long for

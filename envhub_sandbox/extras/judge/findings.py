@@ -7,6 +7,7 @@ from bisect import insort
 from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, RemoteEnvError, WorkerDiedError, WorkerTimeoutError
@@ -148,7 +149,7 @@ class Report:
             task=printable(finding.task, 200),
             file=printable(finding.file, 500),
         )
-        insort(self.findings, kept, key=lambda finding: finding.check.severity.rank)
+        insort(self.findings, kept, key=attrgetter("check.severity.rank"))
         return kept
 
     def failures(self, fail_on: Severity, allowed: Collection[str] = ()) -> list[Finding]:

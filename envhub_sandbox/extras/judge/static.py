@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from importlib import metadata
+from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any
@@ -77,7 +78,7 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Surve
     found.add(_in_place(snapshot))
     found.add(_in_front(snapshot))
     left, unread = _MOST_BYTES_IN_ALL, 0
-    for record in sorted(snapshot.files, key=lambda record: record.path):
+    for record in sorted(snapshot.files, key=attrgetter("path")):
         path = snapshot.root / record.path
         ending = bytes_of(path, contents.ENDING, max(record.size - contents.ENDING, 0))
         kind = contents.kind_of_contents(record.path, bytes_of(path, contents.BEGINNING), ending)
@@ -309,7 +310,7 @@ def static(snapshot: Snapshot) -> Static:
         entries=() if entry is None else entry.entries,
         imports=imports(snapshot, parsed),
         declared=says,
-        findings=sorted(map(_printable, findings), key=lambda finding: finding.check.severity.rank),
+        findings=sorted(map(_printable, findings), key=attrgetter("check.severity.rank")),
     )
 
 

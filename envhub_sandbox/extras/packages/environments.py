@@ -25,6 +25,7 @@ import stat
 import subprocess
 import time
 from dataclasses import asdict, dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -144,7 +145,8 @@ def every() -> list[Environment]:
     found = [_read(record.parent) for record in root().glob(f"[!.]*/{RECORD}")]
     return sorted(
         (environment for environment in found if environment is not None),
-        key=lambda environment: -environment.used,
+        key=attrgetter("used"),
+        reverse=True,
     )
 
 

@@ -19,6 +19,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -189,7 +190,7 @@ def imports(snapshot: Snapshot, files: Files) -> list[Import]:
     text says. What may be missing does not count, nor what nothing leads to.
     """
     found = _ImportWalk(snapshot, files).imports
-    return sorted(found, key=lambda statement: (statement.file, statement.line, statement.name))
+    return sorted(found, key=attrgetter("file", "line", "name"))
 
 
 def ids(snapshot: Snapshot, files: Files) -> list[tuple[str, str, int]]:

@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import IO, Any
 
@@ -274,7 +275,7 @@ def _said(kind: bytes, data: bytes, title: str) -> dict[str, str]:
 def check_zip(members: Sequence[zipfile.ZipInfo], title: str) -> None:
     """Refuse what is no file or folder, what Python unpacks whole, and what lies in another."""
     end = 0
-    for member in sorted(members, key=lambda member: member.header_offset):
+    for member in sorted(members, key=attrgetter("header_offset")):
         kinds = (0, stat.S_IFREG, *([stat.S_IFDIR] if member.is_dir() else []))
         if stat.S_IFMT(member.external_attr >> 16) not in kinds:
             raise _no_file(title, member.filename)

@@ -22,6 +22,7 @@ import shutil
 import zipfile
 import zlib
 from dataclasses import asdict, dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 
 from packaging import tags
@@ -246,7 +247,7 @@ def every() -> list[KeptWheel]:
             parse_wheel_filename(wheel.name)
             size, used = wheel.stat().st_size, record.stat().st_mtime
             found.append(KeptWheel(wheel.name, size, used, record.parent))
-    return sorted(found, key=lambda wheel: -wheel.used)
+    return sorted(found, key=attrgetter("used"), reverse=True)
 
 
 def describe(wheel: Path) -> WheelOrigin | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 import gymnasium as gym
@@ -200,7 +201,7 @@ def relisted(lock: LockFile) -> LockFile:
     interpreter = interpreters.find(lock.runner.python)
     options = pylock.pins(lock.packages).options
     found = pylock.listed(pins, interpreter.path, options, refresh=True)
-    packages = tuple(sorted((*built, *found), key=lambda package: package.name))
+    packages = tuple(sorted((*built, *found), key=attrgetter("name")))
     return replace(lock, packages=packages)
 
 

@@ -14,6 +14,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -142,7 +143,7 @@ def read(document: Mapping[str, Any], where: str) -> tuple[PylockPackage, ...]:
     names = [package.name for package in found]
     if len(set(names)) != len(names):
         raise LockError(f"{where} names a package twice; a lock of envhub is for one interpreter")
-    return tuple(sorted(found, key=lambda package: package.name))
+    return tuple(sorted(found, key=attrgetter("name")))
 
 
 def _package(given: object, where: str) -> PylockPackage:
