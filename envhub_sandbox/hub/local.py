@@ -12,7 +12,6 @@ file may have anything beside it, so no link is followed, and no file that holds
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import os
 import posixpath
@@ -88,9 +87,6 @@ class Checkout(Protocol):
 
     def tracks_below(self, folder: str) -> bool:
         """Whether git knows a file in a folder."""
-
-    def names_in(self, folder: str) -> frozenset[str]:
-        """What the files in a folder are called."""
 
 
 class LocalFile(NamedTuple):
@@ -274,12 +270,11 @@ class LocalFolder:
         own_files = extras.required(
             "envhub_sandbox.extras.sources.own", "own_files", str(self), "name its folder"
         )
+        own = own_files(self.root, entry, self.checkout)
         if self.checkout is None:
-            own = own_files(self.root, entry, _names_below(self.root))
             for name in sorted(own):
                 yield from self._one(self.root / name, name, (self.root,))
             return
-        own = own_files(self.root, entry, self.checkout.names_in)
         folders = tuple(name for name in own if name.endswith("/"))
         for item in self._committed(self.checkout, self.root, ""):
             is_tracked = item.path in self.checkout.tracked
@@ -369,26 +364,6 @@ def _is_venv(folder: Path) -> bool:
     program, other = folder / "bin/python", folder / "Scripts/python.exe"
     is_made = os.path.islink(program) or os.path.isfile(other)  # which raise nothing
     return is_made and os.path.isfile(folder / "pyvenv.cfg")
-
-
-def _names_below(root: Path) -> Callable[[str], Collection[str]]:
-    """Gives the names of the files in a folder below ``root``; no link counts, or is followed."""
-
-    @functools.cache
-    def names(folder: str) -> Collection[str]:
-        path = root / folder
-        is_plain = not folder or all(map(str.isidentifier, folder.split("/")))
-        if not is_plain or os.path.realpath(path) != str(path):
-            return ()
-        try:
-            with os.scandir(path) as listing:
-                return frozenset(
-                    item.name for item in listing if item.is_file(follow_symlinks=False)
-                )
-        except OSError:
-            return ()
-
-    return names
 
 
 def _is_empty_folder(path: Path) -> bool:

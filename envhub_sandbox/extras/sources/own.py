@@ -6,10 +6,13 @@ modules are taken that are imported by name: else a stranger's file had any fold
 
 from __future__ import annotations
 
+import functools
+import os
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 from envhub_sandbox.extras.sources import parsing
+from envhub_sandbox.extras.sources.checkout import Checkout
 
 _INIT = "__init__.py"
 _MACHINE_CODE = (".so", ".pyd")
@@ -23,10 +26,31 @@ Names = Callable[[str], Collection[str]]
 """The names of the files in a folder, which is written with ``/``."""
 
 
-def own_files(root: Path, entry: str, names: Names) -> set[str]:
+def _names_below(root: Path) -> Names:
+    """Gives the names of the files in a folder below ``root``; no link counts, or is followed."""
+
+    @functools.cache
+    def names(folder: str) -> Collection[str]:
+        path = root / folder
+        is_plain = not folder or all(map(str.isidentifier, folder.split("/")))
+        if not is_plain or os.path.realpath(path) != str(path):
+            return ()
+        try:
+            with os.scandir(path) as listing:
+                return frozenset(
+                    item.name for item in listing if item.is_file(follow_symlinks=False)
+                )
+        except OSError:
+            return ()
+
+    return names
+
+
+def own_files(root: Path, entry: str, checkout: Checkout | None) -> set[str]:
     """The paths of a file's own below ``root``; of a package its folder, with a slash at its end.
     Nothing is imported or run.
     """
+    names = _names_below(root) if checkout is None else checkout.names_in
     files, waiting, left = set[str](), {entry}, parsing.MOST_BYTES_IN_ALL
     for _ in range(_MOST_ROUNDS):
         files |= waiting
