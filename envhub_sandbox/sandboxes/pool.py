@@ -44,10 +44,10 @@ class WorkerServer(ABC):
         fd_path: The socket that takes descriptors, or None where memory cannot be shared.
         layers: What confines the server itself, with all of its jails, one mapping a layer:
             ``layer``, ``enforced``, ``detail``.
-        silent_s: When it last did not answer to the end of a jail, by the monotonic clock.
-        far: Its key and ours, where it is on another host and sees no file of this one.
-        uploading: Held while something is brought to such a one.
-        is_ours: Whether we have started it, and end it.
+        silent_s: When it last failed to answer the end of a jail, by the monotonic clock.
+        far: The keys, if it is on another host and sees no file of this one.
+        uploading: Held during an upload to a server on another host.
+        is_ours: Whether we started it, and will end it.
     """
 
     endpoint: str
@@ -77,7 +77,7 @@ S_co = TypeVar("S_co", bound=WorkerServer, covariant=True)
 
 
 class _Entry(Generic[S_co]):
-    """A server, its uses, and until when it is kept after them; None until this process ends."""
+    """A server, its uses, and until when to keep it after them; None until this process ends."""
 
     def __init__(self, key: Hashable, server: S_co) -> None:
         self.pid = os.getpid()
@@ -88,17 +88,17 @@ class _Entry(Generic[S_co]):
         self._uses: list[weakref.ref[ServerUse[Any]]] = []
 
     def uses(self) -> list[ServerUse[Any]]:
-        """Those that have not been given back."""
+        """The uses that have not been given back."""
         live = (ref() for ref in self._uses)
         return [use for use in live if use is not None and use.live]
 
     def add(self, use: ServerUse[Any]) -> None:
-        """There is one more; those that have ended are forgotten."""
+        """Add a use, and forget those that have ended."""
         self._uses = [*map(weakref.ref, self.uses()), weakref.ref(use)]
 
 
 class ServerUse(Generic[S_co]):
-    """One use of a server, which ends once: given back, or when nothing refers to it any more.
+    """One use of a server. It ends once: when it is given back, or collected as garbage.
     ``live``: whether it has not been given back.
     """
 
@@ -112,14 +112,14 @@ class ServerUse(Generic[S_co]):
         entry.add(self)  # from here on the server may not be ended
 
     def users(self) -> int:
-        """How many uses of the server there are."""
+        """The number of uses of the server."""
         return len(self._entry.uses())
 
     def release(self) -> None:
-        """Give it back; the last one who does gives the server up. Idempotent.
+        """Give the use back, and with the last one the server. Idempotent.
 
-        If interrupted, the next call finishes the work. A fork does nothing: a thread that does
-        not exist there may have held the lock.
+        After an interrupt, the next call finishes the work. A fork does nothing: a thread that
+        does not exist there may hold the lock.
         """
         if not self._done and self._entry.pid == os.getpid():
             self._done = self._pool.give_back(self, self._entry, self._idle_s)
@@ -158,13 +158,10 @@ class ServerPool(Generic[S]):
         idle_s: float | None = 0.0,
         group: Hashable = None,
     ) -> ServerUse[S]:
-        """A use of the server with this key, in use or idle; started if none runs.
-
-        Args:
-            start: Starts it.
-            idle_s: For how long it is kept if this use is the last; 0 ends it, None keeps it until
-                the end of this process.
-            group: Who shares it. One of another group gets it only while it is unused.
+        """A use of the server with this key; ``start`` starts one if none runs.
+        ``idle_s``: how long to keep it after its last use, if this is it; None until this process
+        ends.
+        ``group``: who shares it. Another group gets it only while it is unused.
         """
         slot = os.getpid(), key, group
         with self._changed:
@@ -187,7 +184,7 @@ class ServerPool(Generic[S]):
                 return use
 
     def give_back(self, use: ServerUse[S], entry: _Entry[S], idle_s: float | None) -> bool:
-        """For ``ServerUse`` alone: end it, or go on where that was interrupted; True at the end."""
+        """End a use, or finish an interrupted end; True when done. For ``ServerUse`` alone."""
         with self._changed:
             use.live = False
             if entry.uses():
@@ -212,7 +209,7 @@ class ServerPool(Generic[S]):
         self._watch()
 
     def _take(self, key: Hashable) -> _Entry[S] | None:
-        """The idle one with this key, for the caller; one that has died is ended soon."""
+        """Take an idle server with this key; one that has died is ended soon."""
         for entry in self._mine():
             if entry.key == key:
                 if entry.server.runs:
@@ -250,7 +247,7 @@ class ServerPool(Generic[S]):
                 raise
 
     def _due(self) -> S | None:
-        """The next whose time has come; None, and the end of the thread, once there is none."""
+        """Wait for the next idle server to end; None, which ends the thread, if none is timed."""
         with self._changed:
             while (earliest := self._earliest()) is not None:
                 until, entry = earliest
@@ -263,11 +260,11 @@ class ServerPool(Generic[S]):
             return None
 
     def stop_idle(self) -> None:
-        """End the idle ones now, and wait for those that are ending."""
+        """End idle servers now, and wait for those that are ending."""
         self._stop(self._mine)
 
     def stop_all(self) -> None:
-        """End all that this process has started, and keep none from now on: at its exit."""
+        """End all servers of this process, and keep none from now on: at its exit."""
         self._ends = True
         process_id = os.getpid()
         self._stop(
@@ -290,7 +287,7 @@ class ServerPool(Generic[S]):
                 stack.callback(entry.server.stop)
 
     def forked(self) -> None:
-        """In a fork no thread holds the lock, and none waits: interruption.md, rule 14."""
+        """In a fork, drop locks and threads of the parent: interruption.md, rule 14."""
         self._changed = threading.Condition(threading.RLock())
         self._starts.clear()
         self._thread = None
@@ -327,7 +324,7 @@ class ServerHold:
         self._pending_closes: list[Callable[[], None]] = []
 
     def enter(self) -> Callable[[], None]:
-        """There is one environment more; returns what says that it is closed. Idempotent."""
+        """Add an environment; returns an idempotent function that removes it."""
         ticket = object()
         with self._lock:
             self._on_enter()
@@ -335,7 +332,7 @@ class ServerHold:
         return lambda: self._leave(ticket)
 
     def keep(self, used: WorkerServer) -> None:
-        """A jail is opened in a server: keep that, if there are environments to come."""
+        """Keep the server in which a jail is opened, while environments may need it again."""
         with self._lock:
             if not self._open or self._is_kept(used):
                 return
@@ -348,7 +345,7 @@ class ServerHold:
     def close_later(self, server: WorkerServer, wait: Callable[[], None]) -> bool:
         """Let the next close wait for the end of this jail; False if this is the last close.
 
-        Waits for the jails that were deferred earlier, most of which have ended by now.
+        Waits for jails that were deferred earlier; most have ended by now.
         """
         with self._lock:
             if not self._is_kept(server) or len(self._open) <= 1:
@@ -358,7 +355,7 @@ class ServerHold:
         return True
 
     def settle(self) -> bool:
-        """Wait for the jails that are on their way out; whether there was one."""
+        """Wait for jails that are ending; whether there was one."""
         settled = False
         while self._pending_closes:
             try:
@@ -374,7 +371,7 @@ class ServerHold:
         return use is not None and use.live and use.server is server
 
     def _leave(self, ticket: object) -> None:
-        """If interrupted, the next call finishes the work: interruption.md, rule 7."""
+        """Remove an environment; an interrupted call can be repeated: interruption.md, rule 7."""
         if not self._owner.is_here:
             return  # a fork: the server is the parent's, and another thread may have held the lock
         with self._lock:

@@ -63,7 +63,7 @@ _BEGUN = {f".{_CLIENT_FILE}", f".{_LOCK_FILE}"}
 _SOCKET_BYTES = 107
 _LONGEST = f"/{CONTAINER}12345678/sockets/server"
 _EMPTY_S = 60.0
-"""No client needs so long from a folder to the first file in it."""
+"""A client needs less time between making a folder and the first file in it."""
 
 
 def worker_program(*arguments: str) -> list[str]:
@@ -73,13 +73,10 @@ def worker_program(*arguments: str) -> list[str]:
 
 class LocalServer(WorkerServer):
     """A worker server that we start.
-
-    Args:
-        prefix: What the name of its folder begins with.
-        sockets: The part of the folder that its sockets lie in.
-        stop_s: How long its process may take to end.
-
-    ``process``: what was started: the server itself, or what ends it when it ends.
+    ``prefix``: the beginning of its folder's name.
+    ``sockets``: the part of the folder where its sockets lie.
+    ``stop_s``: how long its process may take to end.
+    ``process``: the server, or the monitor of its container.
     """
 
     fd_path: str
@@ -109,8 +106,8 @@ class LocalServer(WorkerServer):
 
     @contextlib.contextmanager
     def starting(self, start: Callable[[int], subprocess.Popen[bytes]]) -> Iterator[int]:
-        """Start the process; gives the pipe that it answers on. What fails in here ends it.
-        ``start``: starts it, with the end of the pipe that it writes to.
+        """Start the process; gives the pipe on which it says that it is ready. A failure ends it.
+        ``start``: starts it, given the end of the pipe that it writes to.
         """
         try:
             ready, ready_end = os.pipe()
@@ -132,9 +129,8 @@ class LocalServer(WorkerServer):
     def runs(self) -> bool:
         """Whether it has not ended, and can be reached.
 
-        One that was killed is a zombie before its threads are gone, and only then can it be waited
-        for: it takes no requests any more. Nor can anyone connect to one whose sockets a cleaner
-        of temporary files has removed; who is connected already goes on.
+        A killed server is a zombie until its threads are gone, and can only then be waited for.
+        Nobody can connect if a cleaner of temporary files has removed its sockets.
         """
         alive = self.process.poll() is None and not has_ended(self.process.pid)
         return alive and self._runtime.has_sockets(*self._sockets)
@@ -264,7 +260,6 @@ PROCESS = ProcessSandbox()
 
 class RuntimeFolder:
     """A new private folder, which is in use as long as this process lives.
-    ``prefix``: what its name begins with.
     Raises ``SandboxUnavailableError``: there is no place for one.
     """
 
@@ -287,7 +282,7 @@ class RuntimeFolder:
 
 
 def _made(prefix: str) -> Path:
-    """A new folder in the first place that takes one: whether it does only an attempt can tell."""
+    """A new folder in the first of the ``places`` where one can be made."""
     why = ""
     for parent in places():
         if _is_short(parent):
@@ -303,7 +298,7 @@ def _made(prefix: str) -> Path:
 
 
 def places() -> list[Path]:
-    """Where they may lie, best first: a short one stands in for a temporary folder that is not."""
+    """Where runtime folders may lie, best first; sockets need a short path."""
     parents = []
     with contextlib.suppress(FileNotFoundError):  # nothing can be written here
         parents.append(Path(tempfile.gettempdir()))
@@ -320,7 +315,7 @@ def _is_short(folder: Path) -> bool:
 
 
 def stale_folders(parent: Path) -> Iterator[Path]:
-    """Ours below one of the places whose client has ended, or the server without a client."""
+    """Our folders below ``parent`` whose client, or server without a client, has ended."""
     for path in sorted(parent.glob(f"{SERVER}*")):
         with contextlib.suppress(OSError):
             if _NAME.fullmatch(path.name) and _belongs_to_us(path) and _is_deserted(path):
@@ -328,9 +323,9 @@ def stale_folders(parent: Path) -> Iterator[Path]:
 
 
 def remove_stale() -> list[Path]:
-    """Remove those that were not another machine's, or this one's before it started anew; which.
+    """Remove stale folders that this machine made since it booted; returns them.
 
-    These are for people to judge: a file system may be shared, and not pass locks on.
+    Others are left for people to judge: a shared file system may not pass locks on.
     """
     folders = [path for parent in places() for path in stale_folders(parent)]
     ours = [path for path in folders if not _is_elsewhere(path)]
@@ -342,8 +337,7 @@ def remove_stale() -> list[Path]:
 
 def is_in_use(path: Path) -> bool:
     """Whether the client of a folder lives.
-    Raises ``FileNotFoundError``: it is no folder of a client, or not one of this machine;
-    ``OSError``: that cannot be known.
+    Raises ``FileNotFoundError``: it is no folder of a client here; ``OSError``: it is not known.
     """
     if not (path.is_absolute() and _NAME.fullmatch(path.name)):
         raise FileNotFoundError(errno.ENOENT, "it is no runtime folder", str(path))

@@ -47,7 +47,7 @@ class Sandbox:
     Attributes:
         name: How errors call it.
         is_here: Whether jails run on this machine and see its files.
-        retry_s: For how long to wait for room in a place that others use, too.
+        retry_s: How long to wait for room in a place that is shared with others.
     """
 
     name: str
@@ -57,19 +57,17 @@ class Sandbox:
     def for_repository(
         self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
     ) -> Sandbox:
-        """The place for one repository, where each gets a server that sees no other's files.
-
-        Starts nothing, and connects to nothing.
-        ``runtime``: the interpreter that the caller named, or none, and the repository's packages.
-        ``assets``: the verified files of further repositories that its jails are shown.
+        """The place for one repository, whose server sees no other's files; starts nothing.
+        ``runtime``: the interpreter that the caller named, if any, and the repository's packages.
+        ``assets``: verified files of further repositories that its jails see.
         Raises ``PolicyError``: the place cannot permit what the policy does;
         ``SandboxUnavailableError``: there is no such place here.
         """
         return self
 
     def workers(self, num_workers: int | None) -> Sequence[Sandbox]:
-        """The places of the workers that an environment is spread over, each with a jail of its
-        own; for most it is one jail, in which ``num_workers`` are processes."""
+        """The places of an environment's workers, each with a jail of its own. In most places it
+        is one jail with ``num_workers`` processes."""
         return [self]
 
     @property
@@ -78,10 +76,10 @@ class Sandbox:
         return self.name
 
     def note_interpreter(self, runtime: Runtime) -> None:
-        """The interpreter of this machine that the caller named, before all else."""
+        """Note the interpreter of this machine that the caller named, before all else."""
 
     def candidates(self) -> Iterator[Sandbox]:
-        """The places where a jail may be opened: the next one, if the one before has no room."""
+        """The places where a jail may be opened, in the order in which to try them."""
         yield self
 
     def runs_on(self, runtime: Runtime) -> Runtime:
@@ -99,10 +97,9 @@ class Sandbox:
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
     ) -> ServerUse[WorkerServer]:
-        """Use a server that may show snapshots below ``store`` to jails. Servers are shared.
-        ``runtime``: what its first jail runs on. A hint: others may run on something else.
-        ``idle_s``: for how long the server is kept for the next user, where this use is its last; 0
-        ends it at once, None keeps it for as long as this process lives.
+        """Use a server, which is shared, that may show snapshots below ``store`` to jails.
+        ``runtime``: a hint on what its first jail runs on.
+        ``idle_s``: how long to keep the server after its last use; None while this process lives.
         Raises ``SandboxUnavailableError``: there is no such place here; ``WorkerStartupError``: the
         server did not come up.
         """
@@ -120,10 +117,9 @@ class Sandbox:
 
 
 def may_go_elsewhere(error: EnvHubError) -> bool:
-    """Whether another place is worth a try: this one has no room, or is not there.
+    """Whether to try another place, since this one has no room or cannot be reached.
 
-    What the repository does would be the same elsewhere, and a key that is refused is a mistake
-    that has to be known.
+    A repository would fail elsewhere too, and a refused key is a mistake to report.
     """
     if isinstance(error, WorkerDiedError):
         return error.reason in ("connection", "server")
@@ -153,11 +149,10 @@ def retry_while_busy(
     label: str,
     refusal: EnvHubError | None = None,
 ) -> T:
-    """Ask, and ask again while the answer is that there is no room.
+    """Ask again as long as there is no room.
 
-    The server keeps the order of those who go on asking: so the second time is soon, and takes the
-    place in the line. The time in the line does not count against the deadline.
-    ``deadline``: for all else; once it is given up, the waiting ends.
+    A server serves those who ask again in their order, so the second try comes soon, to get a place
+    in the line. The time in the line does not count against the ``deadline``.
     ``refusal``: the answer to an earlier try.
     Raises ``ServerBusyError``: there was no room in all that time.
     """
@@ -179,12 +174,12 @@ def retry_while_busy(
 
 
 def is_draining(error: EnvHubError) -> bool:
-    """Whether another in its place is worth waiting for."""
+    """Whether the server is shutting down, so that another may replace it."""
     return isinstance(error, ServerBusyError) and error.quota == DRAINING
 
 
 def is_unanswered(error: EnvHubError) -> bool:
-    """Whether there was no answer, so that it may have been between two servers."""
+    """Whether there was no answer, as in the moment between two servers."""
     if isinstance(error, WorkerDiedError):
         return error.reason == "connection"
     return isinstance(error, UnreachableError)

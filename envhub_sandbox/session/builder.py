@@ -60,7 +60,7 @@ class JailSource:
         self.launcher.interrupt(loaded)
 
     def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
-        """Drop the connection; the last user's jail ends, which one need not wait for."""
+        """Give a jail back; with ``wait``, until nothing of it is left."""
         self.launcher.close(loaded, wait=wait)
 
 
@@ -127,7 +127,7 @@ class SharedJail(JailSource):
 
 
 class Builder:
-    """Builds one environment, as often as that is needed.
+    """Builds one environment, again after each restart.
     ``results``: what the environment is expected to be, and its slices, one for each shard.
     """
 
@@ -144,7 +144,7 @@ class Builder:
         self._number = next(_numbers)  # in every jail: what was packed for one, another understands
 
     def build(self, loaded: LoadedJail, deadline: Deadline) -> Lane:
-        """Build all of it in a loaded jail; returns the way to its runners there.
+        """Build the environment in a loaded jail; returns the lane to its runners.
         Raises ``LoadError``: ``make_env`` returned something else than before; ``WorkerError``: the
         jail died, or took too long.
         """
@@ -163,7 +163,7 @@ class Builder:
     def rebuild(
         self, loaded: LoadedJail, lane: Lane, dead: Sequence[int], deadline: Deadline
     ) -> None:
-        """Build some shards again, each in a fresh runner in the same jail.
+        """Build some shards again, each in a fresh runner of the same jail.
         Raises ``LoadError`` or ``RemoteEnvError``: the repository failed this time;
         ``WorkerError``: they died again, or took too long.
         """
@@ -212,8 +212,8 @@ class Builder:
             typed_reply(reply, m.Value)
 
     def _check_built(self, reply: m.BuildDone, start: int, stop: int) -> Pair:
-        """Hold what was built against the manifest; returns the spaces of one sub-environment of
-        it. Trust: input from the worker.
+        """Compare what was built with the manifest; returns the spaces of one sub-environment.
+        Trust: input from the worker.
         """
         most = self._repository.policy.limits.elements
         built, wanted = decode_env(reply.manifest, max_elements=most), self._manifest

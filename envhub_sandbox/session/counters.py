@@ -51,7 +51,7 @@ class Counters:
         self._total_ns += elapsed_ns
 
     def connected(self, connection: Lane | None) -> None:
-        """From now on this connection serves the environment; None: no connection does."""
+        """Count the traffic of this connection from now on; None for no connection."""
         if connection is not self._connection:
             self._before, self._connection = self._traffic(), connection
 
@@ -95,7 +95,7 @@ class Counters:
 
 
 _ONCE = ("requests", "steps", "step_seconds")
-"""Counted once for all workers; all else is their sum."""
+"""Counted for the whole; all else is the sum of the workers'."""
 _OF_EACH = (
     *("steps", "timeouts", "deaths", "restarts"),
     *("stale_replies", "sent_bytes", "received_bytes"),

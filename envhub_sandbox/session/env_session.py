@@ -41,7 +41,7 @@ from envhub_worker.protocol.manifest.manifest import EnvManifest
 
 _USAGE = ("processes", "threads", "files", "memory_bytes")
 _MOST = 1 << 63
-"""Of anything that there may be: a server on another host may send larger numbers."""
+"""A limit for plausible counts: a server on another host may send any number."""
 GRACE_S = 2.0
 """How long ``reset`` waits for a late reply before it gives the jail up and starts another."""
 
@@ -54,9 +54,9 @@ class EnvSession:
 
     Args:
         bounds: The slices of its sub-environments, one for each shard.
-        trials: Takes note of what its steps took.
-        whole: Where it is one worker of a fleet: the recorder of the whole environment. The fleet
-            then counts for all of them.
+        trials: Remembers how long its steps took.
+        whole: The recorder of the whole environment, if this is one worker of a fleet, which then
+            is counted instead of its workers.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class EnvSession:
         _living.add(self)
 
     jails = 1
-    """That it lives in at a time."""
+    """How many jails it has at a time."""
 
     @property
     def rows(self) -> tuple[int, int]:
@@ -105,7 +105,7 @@ class EnvSession:
 
     @contextmanager
     def naming(self) -> Iterator[None]:
-        """Say in an error which sub-environments of a fleet it is of, and where these run."""
+        """Say in errors which sub-environments of a fleet they are of, and where these run."""
         try:
             yield
         except EnvHubError as error:
@@ -113,11 +113,7 @@ class EnvSession:
             raise
 
     def name_in(self, error: EnvHubError) -> None:
-        """Add that to its text, once.
-
-        An exception of the repository's own keeps its text, and what cannot be sent is the
-        caller's.
-        """
+        """Add these to the error's text, once, unless the repository or the caller caused it."""
         if isinstance(error, (RemoteEnvError, LocalProtocolError)) or not error.args:
             return
         start, stop = self.rows
@@ -145,7 +141,7 @@ class EnvSession:
         return self.lease.lane is None or self.lifecycle.state is State.READY
 
     def take_apart(self, deadline: Deadline) -> bool:
-        """Whether infos come as each sub-environment gives them from now on: ``Results.apart``."""
+        """Have infos come as each sub-environment gives them, if possible: ``Results.apart``."""
         with self.use.hold("make_env"):
             if not self.lease.results.apart and self.may_take_apart:
                 self.lease.take_apart(deadline)
@@ -154,12 +150,11 @@ class EnvSession:
     # --- brought back --------------------------------------------------------------------------
 
     def recover(self, grace: Deadline | None = None) -> None:
-        """Before a reset: catch up with a late reply, or give up the jail that owes it.
+        """Before a reset, catch up with a late reply, or give up the jail that owes it.
 
-        ``grace`` is how long a late reply is waited for, where several environments share that.
-
-        A reply whose wait was interrupted counts as late. After a death a fresh jail is started
+        A reply whose wait was interrupted counts as late. After a death, a fresh jail is started
         only if the policy says ``restart="on_reset"``.
+        ``grace`` is how long to wait for late replies; several workers share it.
         """
         ready = self.lifecycle.state is State.READY and not self.prewarm.unused
         if ready and self.repository.timeouts.idle_s is None:
@@ -181,7 +176,7 @@ class EnvSession:
                 self._forget()
 
     def notice_death(self) -> None:
-        """Before a reset, where another worker has died: find out whether this one has, too."""
+        """Before a reset, after the death of another worker, find out whether this one died too."""
         if self.lifecycle.state is State.READY:
             with self.use.hold("reset"):
                 try:
@@ -228,7 +223,7 @@ class EnvSession:
     def close(self) -> None:
         """Close the environment and end its processes, in bounded time, from any thread.
 
-        Idempotent; where a Ctrl-C came into it, the next one goes on with what is left.
+        Idempotent; after a Ctrl-C, the next call finishes the work.
         """
         if self.lifecycle.closed:
             self._finish()
@@ -273,9 +268,8 @@ class EnvSession:
         self._restarts.give_up()
 
     def _interrupt(self) -> None:
-        """Another thread waits for a reply: end its jail, then clean up: interruption.md, rule 11.
-
-        If that thread does not release the lock in time, it cleans up itself.
+        """End the jail whose reply another thread waits for, then clean up: interruption.md, rule
+        11. If that thread does not release the lock in time, it cleans up itself.
         """
         # The other thread holds the lock and may wait without end, so we cannot wait for the lock
         # first. CLOSED and the end of the jail are one act under the lease's own lock: a thread

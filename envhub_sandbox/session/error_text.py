@@ -75,10 +75,7 @@ def _line(frame: re.Match[str], snapshot: Snapshot) -> str:
 
 
 def _source(frame: re.Match[str]) -> list[str]:
-    """The line, and below it the caret of a syntax error, whose line alone says little.
-
-    Python indents both alike, by blanks and by the tabs of the line itself.
-    """
+    """The source line and, for a syntax error, the caret below it, which Python indents alike."""
     source = (frame["source"] or "").replace("\t", " ")
     text = source.lstrip(" |")
     shown = one_line(text.rstrip(" |"), _SOURCE_CHARS)
@@ -202,14 +199,13 @@ _NOT_FOUND = (
 )
 _MOST_NAMES, _DEEPEST = 16, 16
 _NAMED_CHARS = 4096
-"""Of a worker's text, in which names are looked for: the search takes time."""
+"""How much of a worker's text is searched for names, which takes time."""
 
 
 def why_missing(error: EnvHubError, snapshot: Snapshot) -> str:
-    """What to do where code of this machine lacks a file or module that its folder has.
+    """Advice if local code lacks a file or module that exists in its folder.
 
-    Trust: the names are read off the worker's text. It decides by them which of our sentences its
-    user reads, and gets no answer.
+    Trust: the names come from the worker's text, which so chooses among our sentences.
     """
     remote = error if isinstance(error, (RemoteEnvError, DependencyError)) else error.__cause__
     if not isinstance(remote, (RemoteEnvError, DependencyError)) or not snapshot.is_local:
@@ -253,9 +249,9 @@ _NAMED_DENIALS, _SHOWN = 8, 200
 
 
 def read_denials(reported: object) -> tuple[str, ...] | None:
-    """What a jail was denied, as its server remembers it; None where it is not recorded.
+    """What a jail was denied, by its server's records; None if that is not recorded.
 
-    Trust: a server on another host may say anything, and paths are a stranger's words.
+    Trust: a server on another host may say anything, and a stranger chose the paths.
     """
     if not isinstance(reported, tuple):
         return None
@@ -264,7 +260,7 @@ def read_denials(reported: object) -> tuple[str, ...] | None:
 
 
 def name_denied(error: WorkerDiedError) -> None:
-    """Say what a process was denied before it ended by itself: many a program dies of that."""
+    """Say in the error what a process was denied before it ended: that is often the reason."""
     text = ""
     if error.denied:
         more = len(error.denied) - _NAMED_DENIALS

@@ -33,9 +33,9 @@ def expiry(operation: str, why: str) -> WorkerDiedError:
 def refusal(
     state: State, operation: str, restart: str, interrupted: str | None = None
 ) -> EnvHubError | None:
-    """Why an environment takes no request now; None if it takes one.
+    """The error of a request that the environment's state does not permit, or None.
 
-    ``restart`` is the policy's; ``interrupted`` the request whose wait was interrupted.
+    ``restart`` is the policy's; ``interrupted`` is the request whose wait was interrupted.
     """
     if state in (State.IDLE, State.READY):
         return None
@@ -84,12 +84,12 @@ class Restarts:
         return self._policy.restart != "never"
 
     def give_up(self) -> None:
-        """No more restarts are needed: a wait in another thread ends soon."""
+        """End a wait for a restart in another thread soon."""
         # interruption.md, rule 12: no Event
         self._given_up = True
 
     def spend(self, operation: str) -> None:
-        """Count one more for an operation, and wait if the last one was a moment ago.
+        """Count a restart, after a pause if the last one was a moment ago.
         Raises ``WorkerDiedError``: there are none left, or the environment was closed.
         """
         budget = self._policy.restart_budget
@@ -114,7 +114,7 @@ class Restarts:
 
 
 def backoff_s(first_s: float, in_a_row: int) -> float:
-    """Seconds to wait before a restart that has so many right before it."""
+    """Seconds to wait before a restart, after ``in_a_row`` others shortly before it."""
     if in_a_row == 0:
         return 0.0
     return min(first_s * 2.0 ** min(in_a_row - 1, 64), _LONGEST_S)
@@ -122,8 +122,7 @@ def backoff_s(first_s: float, in_a_row: int) -> float:
 
 class Failures:
     """The failures of one environment's requests.
-    ``interruption``: the request whose wait was interrupted, so that its reply is late; None where
-    the last late reply has another reason.
+    ``interruption``: the request whose wait was interrupted, if that is why its reply is late.
     """
 
     def __init__(self, lease: Lease, recorder: Recorder) -> None:
@@ -134,7 +133,7 @@ class Failures:
         self.interruption: str | None = None
 
     def timed_out(self, operation: str, deadline: Deadline) -> WorkerTimeoutError:
-        """The deadline of a request came first: the environment is LATE."""
+        """A request's deadline passed: the environment is LATE from now on."""
         self._counters.timeouts += 1
         self.interruption = None
         self._lease.lifecycle.moved(Event.TIMEOUT)
@@ -151,7 +150,7 @@ class Failures:
         self.note_interruption()
 
     def note_interruption(self) -> None:
-        """The reply to the pending request is late, for that reason."""
+        """Note that the pending request's reply is late because its wait was interrupted."""
         self.interruption = self._lease.lifecycle.request or "request"
         self._lease.lifecycle.moved(Event.INTERRUPT)
 
@@ -177,11 +176,10 @@ class Failures:
         return expiry(operation, why)
 
     def dead(self, error: EnvHubError) -> EnvHubError:
-        """The jail has died, or broke a rule of the protocol: the environment is DEAD.
+        """The jail died, or broke a rule of the protocol: the environment is DEAD from now on.
 
-        A jail that still lives is ended: after a broken rule, and where it goes on without the
-        runner that has died. Returns the error for the caller; after a ``close`` it says that the
-        environment was closed.
+        A jail that still lives is ended. Returns the error for the caller, which after a ``close``
+        says that the environment was closed.
         """
         lifecycle, lease = self._lease.lifecycle, self._lease
         operation = lifecycle.request or "a request"

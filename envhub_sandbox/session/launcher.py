@@ -38,21 +38,20 @@ if TYPE_CHECKING:
     from envhub_sandbox.transport.jail import JailHandle
 
 _PLAY_SHARE, _MOST_PLAY_MS = 0.5, 3_600_000
-"""How much of the time for a start may have passed when sub-environments are still played to see
-whether they are independent, and the most of it."""
+"""The share of the start's time, and the most milliseconds, in which sub-environments may be played
+to see whether they are independent."""
 _CLOSE_S = 5.0
 _LOST_S = 1.0
-"""Likewise, where the connection to the server was lost: one that lives ends by itself a jail that
-no client holds."""
+"""To end a jail over a lost connection: a living server ends by itself a jail without a client."""
 _SHARE = 0.5
-"""How much of the time that is left one server of a fleet may take to open a jail."""
+"""The share of the remaining time that one server of a fleet may take to open a jail."""
 _SILENT_S = 30.0
-"""For how long a server that has not answered then is not asked again for the end of a jail."""
+"""For how long a silent server is not asked again to end a jail."""
 _STATUS_S = 1.0
 _DENIED_S = 10.0
 """A caller who has denials recorded wants to know them, also of a host that is busy."""
 _UNKNOWN = ("server", "connection", "gone")
-"""How a jail died of which its server can say nothing."""
+"""Reasons of a death about which its server can say nothing."""
 
 
 @dataclass(frozen=True)
@@ -72,21 +71,20 @@ class ExpectedManifest:
 class LoadedJail:
     """An open jail whose first runner has called ``make_env``.
 
-    It has to be given back. Where a Ctrl-C comes between its taking and its noting, its
-    finalizer does.
+    Its owner must give it back; after a Ctrl-C before the owner noted it, its finalizer does.
 
     Attributes:
         manifest: What ``make_env`` returned, checked.
         loaded: Runners that have called it.
-        use: That of the server that it is in.
-        address: What errors call the place of that.
-        give_back: Gives it back: see ``Launcher.close`` and ``disconnect``.
-        ending: Whether its end was begun.
-        closing: Whether a call of ``Launcher.close`` is at it.
-        ended: Whether it was asked for, so that only the server's use is left.
+        use: The use of its server.
+        address: The server's place in errors.
+        give_back: ``Launcher.close`` or ``Launcher.disconnect``.
+        ending: Whether ending it has begun.
+        closing: Whether a call of ``Launcher.close`` is running.
+        ended: Whether its end was requested, so that only the use of the server is left.
         closed: Whether all was given back.
-        lost: Whether the connection to its server was.
-        changed: Whether it returned something else in one of them than the manifest says.
+        lost: Whether the connection to its server was lost.
+        changed: Whether a runner returned something else than the manifest says.
     """
 
     def __init__(
@@ -111,7 +109,7 @@ class LoadedJail:
 
     @property
     def server(self) -> WorkerServer:
-        """Where it is."""
+        """The server that runs it."""
         return self.use.server
 
     def __del__(self) -> None:
@@ -154,11 +152,11 @@ class Launcher:
         self.server_hold = ServerHold(self._acquire, hold, let_go)
 
     def another(self) -> Launcher:
-        """For a further worker in the same place."""
+        """A launcher for another worker in the same place."""
         return Launcher(self.repository, self._sandbox, self._store)
 
     def where(self, loaded: LoadedJail | None) -> str:
-        """What errors call the place of a jail, or of the next one."""
+        """The place of a jail in errors; of the next one for None."""
         return self._sandbox.address if loaded is None else loaded.address
 
     def hold(self) -> Callable[[], None]:
@@ -171,8 +169,8 @@ class Launcher:
 
     def open(self, deadline: Deadline, expected: ExpectedManifest | None = None) -> LoadedJail:
         """Fork a jail and have its first runner call ``make_env``.
-        ``known``: what that returns. It is then described no more, which for a suite means to build
-        an environment of each of its tasks; ``BuildDone`` is held against it instead.
+        ``expected``: its known result. A suite then need not build each task to describe it; what
+        is built is compared with it later.
         Raises ``LoadError``: the repository failed to load, or returned something unusable;
         ``WorkerError``: the jail did not come up, died, or took too long.
         """
@@ -260,10 +258,8 @@ class Launcher:
         deadline: Deadline,
         sandbox: Sandbox | None,
     ) -> JailHandle:
-        """Open it.
-
-        ``place``: of several servers, which is to leave the next one some time.
-        Raises ``WorkerStartupError``: it has not.
+        """Open a jail; ``sandbox`` is one of several, and must leave time to try the next.
+        Raises ``WorkerStartupError``: it took too long there.
         """
         from envhub_sandbox.transport.jail import open_jail  # sandboxes/process.py says why here
 
@@ -322,7 +318,7 @@ class Launcher:
         return LoadedJail(jail, manifest, reply.manifest, {runner}, use, self.close)
 
     def _wanted_output(self) -> OutputSinks:
-        """Where the next jail's output goes: each has a file of its own."""
+        """Where the output of the next jail goes; each jail has its own file."""
         output = self.repository.policy.output
         if output in ("stderr", "-"):
             return OutputSinks(self.repository.label, None, stderr=True)
@@ -335,7 +331,7 @@ class Launcher:
     def spread(
         self, loaded: LoadedJail, shards: int, deadline: Deadline, task: EnvManifest
     ) -> list[int]:
-        """The first ``shards`` runners of a jail, forked and loaded if they are not yet."""
+        """The first ``shards`` runners of a jail, forked and loaded if needed."""
         jail = loaded.jail
         if len(jail.runners) < shards:
             jail.start_runners(shards - len(jail.runners), deadline)
@@ -348,7 +344,7 @@ class Launcher:
     def load(
         self, loaded: LoadedJail, runners: list[int], deadline: Deadline, task: EnvManifest
     ) -> None:
-        """Have runners of a jail call ``make_env``, for a task that is known."""
+        """Have runners of a jail call ``make_env`` for a known task."""
         jail = loaded.jail
         load = self.repository.arguments
         arguments = load.n_envs, load.use_async_envs, load.cfg, load.env_kwargs
@@ -359,7 +355,7 @@ class Launcher:
         loaded.loaded.update(runners)
 
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
-        """A further connection to an open jail; environments that share one wait apart."""
+        """Another connection to an open jail, for an environment that shares it."""
         use = self._acquire()
         try:  # interruption.md, rule 4
             client = self._connected(use.server, deadline)
@@ -377,11 +373,9 @@ class Launcher:
         loaded.closed = True
 
     def close(self, loaded: LoadedJail, *, wait: bool = True) -> None:
-        """End a jail and give its server back.
-
-        Idempotent. If interrupted, the next call finishes the work.
-        ``wait``: until nothing of it is left; else the close of another environment of the
-        repository waits, if there is one: no later than the last.
+        """End a jail and give its server back. Idempotent; an interrupted call can be repeated.
+        ``wait``: until nothing of it is left; otherwise the next close of an environment of the
+        repository waits for that.
         """
         if loaded.closed or loaded.closing:  # a signal handler may come into it, or a thread
             return
@@ -412,9 +406,9 @@ class Launcher:
     def status(
         self, server: WorkerServer, jail: int, timeout_s: float = _STATUS_S
     ) -> dict[str, Any]:
-        """What its server says of a jail; asked over a connection of its own. Empty if it cannot.
+        """What its server says of a jail; empty if it does not answer.
 
-        The late reply may come at any moment on the jail's own connection, and would be dropped.
+        Asked over a new connection: on the jail's own, a late reply would be dropped.
         Trust: a server on another host may say anything.
         """
         try:
@@ -428,13 +422,13 @@ class Launcher:
         return {}
 
     def denials(self, server: WorkerServer, jail: int) -> tuple[str, ...] | None:
-        """What a jail was denied; None where it is not recorded, or not known any more."""
+        """What a jail was denied; None if that is not recorded, or not known any more."""
         if not self.repository.policy.record_denials:
             return None
         return read_denials(self.status(server, jail, _DENIED_S).get("denied"))
 
     def note_denied(self, error: BaseException, server: WorkerServer, jail: int) -> None:
-        """Put what a jail was denied into the error that it ends with, before it is closed."""
+        """Put what a jail was denied into the error that ended it, before it is closed."""
         if not isinstance(error, EnvHubError) or error.denied is not None:
             return
         if getattr(error, "reason", "") not in _UNKNOWN:
@@ -443,7 +437,7 @@ class Launcher:
                 name_denied(error)
 
     def interrupt(self, loaded: LoadedJail) -> None:
-        """End a jail over a connection of its own, while another thread waits on the first."""
+        """End a jail over a new connection: another thread may wait on its own."""
         loaded.jail.before_end()
         server = loaded.server
         if loaded.lost and monotonic() - server.silent_s < _SILENT_S:
@@ -460,7 +454,7 @@ class Launcher:
 
 
 def _is_what(value: object, task: EnvManifest) -> bool:
-    """Whether an answer to ``LoadTask`` says what is known. Trust: input from the worker."""
+    """Whether an answer to ``LoadTask`` is as expected. Trust: input from the worker."""
     if type(value) is not tuple or tuple(map(type, value)) != (int, bool):
         return False  # arrays, for instance, compare to something else than a bool
     return value == (task.num_envs, task.shardable)

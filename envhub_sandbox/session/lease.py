@@ -44,30 +44,30 @@ if TYPE_CHECKING:
 _WITHOUT_A_JAIL = frozenset({State.EXPIRED, State.DEAD, State.FOREIGN, State.CLOSED})
 """It may not have been given back yet."""
 _COLD_STEPS = 8
-"""The first ones, in which much happens once."""
+"""Steps that are not measured: much happens only once in them."""
 _LONGEST = 30
-"""Of a step, in medians, that counts as one of those that wait for a core."""
+"""A longer step, in medians, counts as this long: it was paused, not waiting for a core."""
 _SUCCESSOR_S = 60.0
 """For how long a restart waits for the server that comes in the place of one that ends."""
 _MOST_READ = 64
 """Names of one environment that are remembered."""
 _MOST_STATES, _STATE_CHARS = 64, 40
-"""Words about runners, of which a server permits as many, and characters of each."""
+"""Words about runners that are shown, and characters of each."""
 _NEVER = 1 << 62
 
 
 class Lease:
-    """The jail of one environment, of which it has one at a time, or none, and the lane there.
+    """The jail of one environment, if it has one, and the lane to its runners.
 
-    Used by the thread that has the environment's lock, but for ``interrupt``, which a closing
-    thread calls, and ``abandon``, which a fork calls.
+    Used by the thread that holds the environment's lock; but a closing thread calls ``interrupt``,
+    and a fork ``abandon``.
 
     Attributes:
         results: What the environment is expected to be, and its slices.
         loaded: The jail; None while there is none.
         lane: The way to its runners there.
         make_room: Asked to end what was started ahead, where a server has no place left.
-        depart: Says that the server is not needed again, at least not by this one. Idempotent.
+        depart: Says that this environment does not need the server again. Idempotent.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class Lease:
         return None if at is None else self._launcher.denials(*at)
 
     def note_denied(self, error: EnvHubError) -> None:
-        """Put that into the error that the jail ends with, before it is given back."""
+        """Put its denials into the error that ended the jail, before the jail is given back."""
         at = self._at()
         if at is not None:
             self._launcher.note_denied(error, *at)
@@ -148,7 +148,7 @@ class Lease:
             self.loaded.jail.output(operation, deadline)
 
     def note_lost(self) -> None:
-        """The connection to the server was lost."""
+        """Note that the connection to the server was lost."""
         loaded = self.loaded  # another thread may give it back
         if loaded is not None:
             loaded.lost = True
@@ -165,7 +165,7 @@ class Lease:
         return lane is not None and lane.jail.watched.note(lane.number, name, values)
 
     def forget_watched(self) -> None:
-        """A reply is lost that may have named changed attributes, of any environment there."""
+        """Forget watched values: a lost reply may have named attributes that changed."""
         loaded = self.loaded  # another thread may give it back
         if loaded is not None:
             loaded.jail.watched.forget()
@@ -233,7 +233,7 @@ class Lease:
         return retry_while_busy(ask, retry_s, deadline, self.repository.label, refused)
 
     def _patience_s(self, error: EnvHubError) -> float:
-        """How long to wait: after a server that ended, where restarts are wanted, for another."""
+        """How long to retry. With restarts, a server that ended is replaced within a minute."""
         retry_s = self._launcher.retry_s if _is_full(error) else 0.0
         if self.repository.policy.restart == "never":
             return retry_s
@@ -297,7 +297,7 @@ class Lease:
             lane.jail.ask("close", [(runner, packed) for runner in lane.runners], deadline)
 
     def note_steps(self) -> None:
-        """Remember what a step took, for the next use of the pin."""
+        """Remember how long steps took, for the next use of the same commit."""
         latencies_s = self.counters.latencies_s()
         if len(latencies_s) >= LEAST_STEPS:
             latencies_s = latencies_s[_COLD_STEPS:]
@@ -308,7 +308,7 @@ class Lease:
             self._trials.note(self.results.manifest, self.results.bounds, step_s)
 
     def let_go(self, *, wait: bool = True) -> None:
-        """Give back whatever is left, for good. A fork of its owner gives back nothing."""
+        """Give back everything for good. In a fork of the owner, do nothing."""
         if not self._owner.is_here:
             return
         try:
@@ -318,8 +318,9 @@ class Lease:
             self.depart()
 
     def interrupt(self, close: Callable[[], None]) -> bool:
-        """In another thread: ``close`` the environment, and end the jail that a request waits for:
-        interruption.md, rule 11. Whether there was one; else who takes one sees that it is closed.
+        """From another thread, ``close`` the environment and end the jail that a request waits for;
+        False if there is none yet: whoever takes one sees that it is closed. See interruption.md,
+        rule 11.
         """
         with self._ending:
             close()
@@ -329,7 +330,7 @@ class Lease:
             return self.loaded is not None
 
     def abandon(self) -> None:
-        """In a fork: close what is this process's own alone. interruption.md, rule 14."""
+        """In a fork, close only what this process owns: interruption.md, rule 14."""
         self._ending = threading.RLock()
         self._release_server = _nothing
         self._close_lane()
@@ -347,7 +348,7 @@ class Lease:
 
 
 def _is_full(error: EnvHubError) -> bool:
-    """Whether it is a refusal for want of room; an older server's may be, of this very type."""
+    """Whether the server has no room. Older servers send a plain ``WorkerError`` for that."""
     return isinstance(error, ServerBusyError) or type(error) is WorkerError
 
 
@@ -358,7 +359,7 @@ def closed_during(operation: str) -> WorkerDiedError:
 
 
 def _nothing() -> None:
-    """There is nothing to give back."""
+    """Release nothing."""
 
 
 # --- attributes that are watched

@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 LOOK_S = 10.0
 """How long a look at a jail that may have died may take."""
 INTERRUPT_S = 10.0
-"""How long ``close`` waits at most for another thread to notice that the jail has gone: no longer
-than it waits for the environment's own ``close``."""
+"""How long ``close`` waits at most for another thread to notice that the jail has ended."""
 _GOING_S = 30.0
 """How long a jail that is given up may take to go: its ``close``, and its processes' ends."""
 
@@ -43,7 +42,7 @@ class Prewarm:
     Attributes:
         unused: Whether it was started ahead, and no reset came yet.
         first_use: Called at the first request; None afterwards.
-        starting: The deadline of a start ahead that is under way, which has the use lock.
+        starting: The deadline of a start ahead, while that runs and holds the use lock.
     """
 
     def __init__(
@@ -110,7 +109,7 @@ class Prewarm:
                     self.starting = None
 
     def cancel(self) -> bool:
-        """Give up what was started ahead, unless it was used since; whether there was any."""
+        """Give up processes that were started ahead and never used; whether there were any."""
         starting = self.starting
         if starting is not None:
             starting.give_up()
@@ -133,7 +132,7 @@ class Prewarm:
             lock.release()
 
     def look_whether_it_lives(self) -> None:
-        """Before a reset: what was started ahead and died unused counts as expired."""
+        """Before a reset, treat what was started ahead and died unused as expired."""
         if not self.unused:
             return
         self.unused = False
@@ -149,11 +148,11 @@ class Prewarm:
     def on_first_use(
         self, first_use: Callable[[], None] | None, make_room: Callable[[], bool]
     ) -> None:
-        """What to call at the first request, and where a server has no place left for it."""
+        """Set what to call at the first request, and when a server has no room."""
         self.first_use, self._lease.make_room = first_use, make_room
 
     def note_use(self) -> None:
-        """A request is made."""
+        """Tell of the first request."""
         if self.first_use is not None:
             first_use, self.first_use = self.first_use, None
             first_use()
@@ -189,7 +188,7 @@ class SuitePrewarm:
                 worker.on_first_use(partial(self._used, task), self.make_room)
 
     def make_room(self) -> bool:
-        """Cancel all unused starts, since a server has no place left; whether there were any."""
+        """Cancel all unused starts, since a server has no room; whether there were any."""
         with self._lock:
             self._wanted = []
             ahead, self._ahead = self._ahead, []
@@ -210,9 +209,9 @@ class SuitePrewarm:
             self._start_threads()
 
     def _start_threads(self) -> None:
-        """One for each task that is to be cancelled or started. The lock is held.
+        """Cancel or start each task in a thread of its own. The lock is held.
 
-        Where the system has no thread left, the request for another task does not fail for it.
+        A lack of threads is logged: the caller's request is for another task and must not fail.
         """
         while (todo := self._next()) is not None:
             thread = threading.Thread(
@@ -255,10 +254,10 @@ class SuitePrewarm:
                     self._cancelled.notify_all()
 
     def _next(self) -> tuple[list[Prewarm], bool] | None:
-        """What to cancel (False) or start (True).
+        """The next task to cancel (False) or to start (True).
 
-        All that are passed over come first, and nothing starts before they have gone: so there are
-        never more unused jails than the count.
+        Nothing starts before all cancelled ones have gone, so there are never more unused jails
+        than the count.
         """
         for task in [task for task in self._ahead if task not in self._wanted]:
             self._ahead.remove(task)

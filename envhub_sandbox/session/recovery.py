@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 RESTARTED = "worker_restarted"
 """The key in the infos: whether a sub-environment was lost and came back reset."""
 _SETTINGS = 256
-"""Attributes that are remembered, the last ones."""
+"""How many attributes are remembered."""
 _SETTERS = frozenset({"__setattr__", "set_wrapper_attr"})
 """Methods of sub-environments that set an attribute."""
 
@@ -61,7 +61,7 @@ class Recovery:
     # --- what is asked -------------------------------------------------------------------------
 
     def started(self) -> None:
-        """There is a fresh jail, in which no attribute was set."""
+        """Forget attributes that were set: the jail is a fresh one."""
         self._settings.clear()
 
     def sent(self, request: Request) -> None:
@@ -76,7 +76,7 @@ class Recovery:
             self._setting = target, request.kept()
 
     def answered(self) -> None:
-        """Every shard has answered it, and none has raised."""
+        """Every shard has answered the request, and none raised: remember what it set."""
         if self._setting is not None:
             target, sent = self._setting
             self._settings.pop(target, None)  # the last one counts, in its place
@@ -88,7 +88,7 @@ class Recovery:
     # --- deaths --------------------------------------------------------------------------------
 
     def deaths_of_all(self, error: WorkerError) -> RunnersDiedError:
-        """The end of the jail, as the death of all shards."""
+        """Treat the end of the jail as the death of all shards."""
         if not isinstance(error, WorkerDiedError):  # another environment there has given it up
             error = WorkerDiedError(str(error), reason="killed")
         shards = range(len(self._bounds))
@@ -96,8 +96,9 @@ class Recovery:
         return RunnersDiedError(replies, dict.fromkeys(shards, error), jail_gone=True)
 
     def survive_request(self, deaths: RunnersDiedError) -> list[m.Message]:
-        """The replies to a reset, which fresh runners repeat; another request is not repeated.
-        Raises ``WorkerDiedError``: it was another one; the next step or reset brings the dead back.
+        """The replies to a reset, which fresh runners repeat.
+        Raises ``WorkerDiedError``: it was another request, which is not repeated; the next step or
+        reset restarts the dead.
         """
         replies = self._of_survivors(deaths)
         if self._lifecycle.request != "reset":
@@ -112,15 +113,15 @@ class Recovery:
         return [typed_reply(reply, m.StepDone) for reply in merged]
 
     def mark(self, infos: dict[Any, Any]) -> dict[Any, Any]:
-        """All infos of the last request, of which those of the fresh shards say that they are."""
+        """Infos of the last request, with marks for the shards that were restarted."""
         if not self.fresh:
             return infos
         results = self._lease.results
         return mark_revived(infos, results.count, [results.slices[index] for index in self.fresh])
 
     def _of_survivors(self, deaths: RunnersDiedError) -> list[m.Message | None]:
-        """What the others answered; None in the place of the dead.
-        Raises ``RemoteEnvError``: one of them raised. The next request meets the deaths.
+        """The replies of the others, and None for the dead.
+        Raises ``RemoteEnvError``: one of the others raised; the next request meets the deaths.
         """
         try:
             for reply in deaths.replies:
@@ -134,9 +135,7 @@ class Recovery:
     def _revive(
         self, replies: list[m.Message | None], deaths: RunnersDiedError, operation: str
     ) -> list[m.Message]:
-        """Have the dead shards brought back, and move on to the state that it leads to; ``replies``
-        with those of the fresh runners.
-        """
+        """Restart the dead shards, and move to the state that follows; returns all replies."""
         lifecycle, failures = self._lifecycle, self._failures
         lifecycle.moved(Event.LOSS)
         failures.keep_crash(deaths.first)
@@ -167,7 +166,7 @@ class Recovery:
         return [reply for reply in merged if reply is not None]
 
     def _bring_back(self, deaths: RunnersDiedError, operation: str) -> dict[int, m.Message]:
-        """What the fresh runners answer to the last of their requests."""
+        """Restart the dead shards; returns the last reply of each fresh runner."""
         if any(death.reason == "protocol" for death in deaths.deaths.values()):
             raise deaths.first  # after a broken rule there is no second chance
         try:
@@ -200,7 +199,7 @@ class Recovery:
             raise self._failures.late("reset", deadline_of_reset) from error
 
     def _set_again(self, lane: Lane, dead: Sequence[int], deadline: Deadline) -> None:
-        """Set attributes in fresh runners; what one's setter raises is only logged."""
+        """Set attributes again in fresh runners; an exception of a setter is only logged."""
         for (name, *_), frames in list(self._settings.items()):
             requests: list[tuple[int, list[Buffer]]] = [
                 (lane.runners[index], [*frames[index]]) for index in dead
@@ -214,7 +213,7 @@ class Recovery:
                     typed_reply(reply, m.Value)
 
     def _messages(self, lane: Lane, index: int, operation: str) -> list[m.Message]:
-        """What a shard's fresh runner is asked, one after the other."""
+        """The requests to a shard's fresh runner, in order."""
         seeds = self._seeds.derived(self._bounds[index], self._counters.restarts)
         if operation == "step":
             return [m.Revive(lane.number, seeds)]
@@ -247,10 +246,10 @@ def _target_of(messages: Sequence[m.Message]) -> tuple[Any, ...] | None:
 
 
 def revived_step(reply: m.StepDone, count: int) -> m.StepDone:
-    """A fresh runner's rows of the step in which another died. Trust: its flags are not used.
+    """The rows of a restarted shard in the step in which it died. Trust: its flags are not used.
 
-    Of the rewards the shape is used where they are an array: then it was paid for in bytes. A
-    described space also has a ``shape``, of any size, for a few.
+    The shape of its rewards is used only if they are an array, whose size was paid for in bytes: a
+    described space has a ``shape`` of any size for a few.
     """
     rewards: Any = reply.rewards
     return m.StepDone(
@@ -265,7 +264,7 @@ def revived_step(reply: m.StepDone, count: int) -> m.StepDone:
 def mark_revived(
     info: dict[Any, Any], count: int, bounds: Iterable[tuple[int, int]] | None = None
 ) -> dict[Any, Any]:
-    """Infos that say of each sub-environment, or of those within, that it came back."""
+    """Infos that mark all sub-environments, or those within ``bounds``, as restarted."""
     yes = np.zeros(count, np.bool_)
     for start, stop in [(0, count)] if bounds is None else bounds:
         yes[start:stop] = True
@@ -276,11 +275,11 @@ def mark_revived(
 
 
 class SeedBook:
-    """What sub-environments were last seeded with, and what those that come back get.
+    """The last seeds of sub-environments, and the seeds of those that are restarted.
 
-    Where the caller gave a seed, what follows a death is derived of it, so that the same run can be
-    had again; where he gave none, the fresh one is drawn by the environment.
-    ``each``: whether they are seeded one by one; otherwise the environment does that by itself.
+    A seed after a restart is derived from the caller's, so that a run can be repeated; without one,
+    the environment draws its own.
+    ``each``: whether sub-environments are seeded one by one, and not by the environment itself.
     """
 
     def __init__(self, num_envs: int, each: bool) -> None:
@@ -289,7 +288,7 @@ class SeedBook:
         self._own: Any = None
 
     def remember(self, reset: m.Reset, start: int = 0) -> None:
-        """Take note of a reset of sub-environments from ``start`` on, or of those in its mask."""
+        """Remember the seeds of a reset of sub-environments from ``start`` on, or of its mask."""
         seeds: Any = reset.seeds
         if seeds is None:
             return
@@ -317,10 +316,10 @@ def derived_seed(seed: int | None, restart: int) -> int | None:
 
 
 def resets(message: m.Reset, derived: Any) -> list[m.Message]:
-    """What a fresh runner is asked in the place of one that died in a reset.
+    """The requests to a fresh runner in place of one that died in a reset.
 
-    The reset itself, with derived seeds where the caller gave none; where it is one of some
-    sub-environments only, all are reset before.
+    It is the same reset, with derived seeds where the caller gave none. If it has a mask, all
+    sub-environments are reset before it.
     """
     if message.mask is not None:
         return [m.Reset(message.env, derived, None, None), message]

@@ -1,10 +1,8 @@
 """One repository under one policy: what all its environments share, and the errors of its start.
 
-What ran (``provenance_of``), and how to make it again in another process (``Recipe``): a process
-cannot be handed over, so a pickle of a proxy holds the arguments that made it. The other side gets
-a fresh environment in a worker of its own, of the very same commit. A token never travels, nor does
-a login in ``endpoint``: the other side uses its own. A config object of the caller crosses as plain
-data (``plain_config``); what has no plain form does not.
+``provenance_of`` says what ran. A pickle of a proxy holds a ``Recipe``, the arguments that made it,
+and makes a fresh environment of the same commit in a worker of its own. It never holds a token or a
+login: the other side uses its own. ``plain_config`` makes plain data of a caller's config object.
 """
 
 from __future__ import annotations
@@ -63,7 +61,7 @@ _SPEC_FACTS = frozenset({"max_episode_steps", "reward_threshold", "nondeterminis
 
 @dataclass(frozen=True)
 class PlainConfig:
-    """What ``make_env`` takes in place of a caller's config object: what of it has crossed."""
+    """The plain data of a caller's config object, which ``make_env`` takes in its place."""
 
     hub_path: str
     values: dict[str, object]
@@ -99,13 +97,9 @@ class Recipe:
         return self.make()[suite][task]
 
     def spec(self, suite: str, task: int | str, facts: Mapping[str, Any] | None) -> EnvSpec:
-        """Of which ``gym.make`` makes one of them again, in a sandbox.
-
-        Args:
-            suite: That the environment is of.
-            task: Likewise.
-            facts: What the repository's own spec says, if it has one. Trust: input from the worker;
-                nothing is taken of how it is made.
+        """A spec from which ``gym.make`` makes one environment again, in a sandbox.
+        ``facts``: those of the repository's own spec. Trust: input from the worker, of which
+        nothing says how the environment is made.
         """
         safe_facts = {name: value for name, value in (facts or {}).items() if name in _SPEC_FACTS}
         if (safe_facts.get("max_episode_steps") or 0) < 1:
@@ -151,15 +145,8 @@ def provenance_of(
     profile: str | None = None,
     places: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """What ran, as plain data: enough to run the same again, or to see that it cannot be the same.
-
-    Args:
-        snapshot: The files; every hash has been verified.
-        manifest: What the worker said. Trust: interpreter and packages are its own words.
-        report: The layers that confine it, once it runs.
-        installed: What was installed for it: our own record.
-        profile: Of its jails, once it runs.
-        places: Where each worker of an environment runs, or is to run; results do not depend on it.
+    """What ran, as plain data: enough to run it again, or to see that it cannot be the same.
+    ``report``: the layers of confinement. Trust: interpreter and packages are the worker's words.
     """
     return {
         "repository": snapshot.repo_id,
@@ -179,7 +166,7 @@ def provenance_of(
 
 
 def _differences(value: Any) -> Any:
-    """Of a policy and the like the fields that are not the default ones; else the value itself."""
+    """The fields of a policy, timeouts or limits that differ from the default; other values."""
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if not isinstance(value, (Policy, Timeouts, Limits)):
@@ -197,22 +184,20 @@ class Repository:
     """What the environments of one ``make_env`` have in common. Opens nothing: see ``Launcher``.
 
     Args:
-        arguments: What the repository's ``make_env`` is called with.
-        runtime: The interpreter of the jails, and their packages.
+        arguments: Those of the repository's ``make_env``.
+        runtime: The interpreter and the packages of the jails.
         copy: Whether observations are copied for the caller, or lent.
         installed: What was installed for it, for the provenance.
-        advice: Says what to do where a module is missing, for the error's text.
-        of_its_day: Says so where packages of today may be at fault; empty for other errors.
+        advice: Makes advice about a missing module, for the error's text.
+        of_its_day: Makes advice if today's packages may be at fault; empty for other errors.
 
     Attributes:
         label: Repository, commit and entry file, for errors.
         wire_limits: Bounds on what a jail may send.
-        warnings: Those that it gave, in any jail.
-        latest_report: The layers of the jail that was opened last, for the provenance of what was
-            made. Which of them hold for an environment, only its own jail says.
-        places: Where each worker of an environment runs, or is to run.
-        jail_numbers: Of the jails whose output goes to files of their own.
-        latest_profile: Of that jail; in a container it may be less than the policy names.
+        warnings: Warnings of the repository in any jail.
+        latest_report, latest_profile: The layers and the profile of the jail that was opened last.
+        places: Where each worker of an environment runs, or will run.
+        jail_numbers: Numbers the jails, for files of their output.
         for_lerobot: Whether LeRobot's programs use it: see ``serve_lerobot``.
     """
 
@@ -268,8 +253,7 @@ class Repository:
         self._in_use = [SharedLock(folder) for folder in folders]
 
     def let_go(self, holder: object) -> None:
-        """No environment of this holder may start a jail any more. Idempotent, also where it was
-        interrupted."""
+        """Let the files be removed, after the last holder. Idempotent, also after an interrupt."""
         self._holders.discard(holder)
         if self._holders:
             return
@@ -307,7 +291,7 @@ class Repository:
 
     @contextmanager
     def starting(self, deadline: Deadline) -> Iterator[None]:
-        """Say what it was that took too long, and keep what led to a death that matters."""
+        """Say in an error what took too long, and write a crash bundle for a death."""
         try:
             yield
         except WorkerDiedError as error:

@@ -72,16 +72,15 @@ class RequestOrder(ABC):
     """The caller's order of requests to one environment, in one jail or in several.
 
     Attributes:
-        results: Makes of replies what Gymnasium returns.
+        results: Turns replies into what Gymnasium returns.
         closed: Whether the caller has called ``close``.
         waiting: The request of an ``*_async`` whose ``*_wait`` has not come yet.
-        face: What the environment is called in the error after ``close``.
-        attributes: Those that need no request.
-        use: A thread that asks something holds its lock until it has handled the answer;
-            between an ``*_async`` and its ``*_wait`` no thread does.
-        stepping: The thread that is in a step, as far as it was not interrupted there.
-        before_request, after_request: Called before each request, and once it was answered, where
-            the caller has random generators of the environment.
+        face: The name of the environment's class in the error after ``close``.
+        attributes: Answers reads of attributes that need no request.
+        use: Its lock is held from before a request until its answer is handled; between an
+            ``*_async`` and its ``*_wait`` it is free.
+        stepping: The thread that is in a step, unless it was interrupted there.
+        before_request, after_request: Keep the caller's random generators up to date, if any.
     """
 
     def __init__(
@@ -120,9 +119,7 @@ class RequestOrder(ABC):
         )
 
     def refuse_if_busy(self, name: str) -> None:
-        """Refuse a request while another waits for its ``*_wait``.
-        Raises ``ClosedEnvironmentError``: it is closed; ``AlreadyPendingCallError``: there is one.
-        """
+        """Raise ``AlreadyPendingCallError`` while another request waits for its ``*_wait``."""
         self.refuse_if_closed()
         if self.waiting is not None:
             raise AlreadyPendingCallError(
@@ -132,7 +129,7 @@ class RequestOrder(ABC):
             )
 
     def refuse_if_closed(self) -> None:
-        """Refuse every request after ``close``. Raises ``ClosedEnvironmentError``: it is closed."""
+        """Raise ``ClosedEnvironmentError`` after ``close``."""
         if self.closed:
             cure = (
                 "reset opens it again" if self._repository.for_lerobot else "make_env makes another"
@@ -143,7 +140,7 @@ class RequestOrder(ABC):
             )
 
     def end_wait(self, operation: str) -> None:
-        """The ``*_wait`` of a request has come. Raises ``NoAsyncCallError``."""
+        """Note that ``*_wait`` was called. Raises ``NoAsyncCallError`` without its ``*_async``."""
         self.refuse_if_closed()
         if self.waiting != operation:
             raise NoAsyncCallError(
@@ -153,18 +150,18 @@ class RequestOrder(ABC):
         self.waiting = None
 
     def ask(self, operation: str, message_for: MessageFor) -> list[m.Value]:
-        """One request, and the values of all shards."""
+        """Send a request, and return the values of all shards."""
         return self._ask(operation, message_for, m.Value, self._timeouts.call_s)
 
     def ask_own(self, operation: str, kind: Callable[..., m.Message], *fields: object) -> m.Message:
-        """Ask about what the repository's vector environment has of its own: one shard has it."""
+        """Ask the repository's own vector environment, which is in one shard."""
         kinds = (m.Value, m.Method)
         message_for = for_every_shard(kind, *fields)
         [reply] = self._ask(operation, message_for, kinds, self._timeouts.call_s)
         return reply
 
     def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
-        """Ask about one sub-environment; the other shards' replies are empty."""
+        """Ask one sub-environment; the replies of other shards are empty."""
         operation = f"envs[{index}].{name[:_SHOWN]}"  # which is no reset or step of all
         timeouts = {"reset": self._timeouts.reset_s, "step": self._timeouts.step_s}
 
@@ -190,7 +187,7 @@ class RequestOrder(ABC):
             return self.collect(timeout_s, kind)
 
     def note_sent(self, actions: Any | None) -> None:  # noqa: B027  # for several workers
-        """Workers were sent a step; with these ``actions``, if all of them were."""
+        """Count a step that was sent; ``actions`` are None where some workers were sent none."""
 
     @abstractmethod
     def submit(
@@ -211,10 +208,9 @@ class RequestOrder(ABC):
         """One value for each sub-environment, out of the shards' replies."""
 
     def explain(self, error: BaseException) -> None:
-        """Before an error goes to the caller.
+        """Prepare an error for the caller, and show the repository's warnings first.
 
-        The repository's warnings come with it; a filter that makes an error of one must not hide a
-        Ctrl-C.
+        A filter that turns a warning into an error must not hide a Ctrl-C.
         Raises ``ClosedEnvironmentError``: a ``close`` in another thread is the reason.
         """
         with suppress(RemoteEnvWarning):
@@ -225,26 +221,24 @@ class RequestOrder(ABC):
             self.refuse_if_closed()
 
     def note_answered(self, kind: object = None) -> None:
-        """A request was answered, by messages of this ``kind``: what is asked now is the next one.
+        """Note that a request was answered, by messages of this ``kind``.
 
-        A reset is answered once ``finish_reset`` is done: that may ask for its infos again, and
-        looks at which processes came back in it.
+        A reset is only answered after ``finish_reset``, which may ask for its infos again.
         """
         if self.after_request is not None and kind is not m.ResetDone:
             self.after_request()
 
     def show_warnings(self) -> None:
-        """Show the repository's new warnings.
+        """Show the repository's new warnings, after all replies are handled.
 
-        Only once the replies are in and handled: what the caller's filters raise is not the
-        worker's fault, and must leave no reply owed.
+        A filter of the caller may raise: that is not the worker's fault, and no reply may be owed.
         """
         if self._unshown:
             self._repository.warnings.show(self._repository.label)
 
 
 class Packed(NamedTuple):
-    """A request that is ready to be sent; what ``sent`` differs is not repeated."""
+    """A request to record, and the one to send in its place, which is mostly the same."""
 
     request: Request
     sent: Request
@@ -275,14 +269,14 @@ class Requests(RequestOrder):
         self._recovery = recovery
 
     def fall_behind(self) -> None:
-        """A request of all workers was not sent to this one: only a reset may follow."""
+        """Permit only a reset: this worker was not sent a request that others were sent."""
         if self.lifecycle.state is State.READY:
             self.lifecycle.on(Event.SUBMIT)
             self.lifecycle.on(Event.TIMEOUT)  # with no request to be late: it begins anew
 
     @property
     def came_back(self) -> bool:
-        """Whether processes did, under the last request."""
+        """Whether processes were restarted during the last request."""
         return self._recovery is not None and bool(self._recovery.fresh)
 
     # --- requests ------------------------------------------------------------------------------
@@ -305,10 +299,9 @@ class Requests(RequestOrder):
     ) -> None:
         """With the lock held, send a request to every shard; opens the jail if there is none.
 
-        ``instead`` makes what is sent in the place of what is recorded, if the answer is to
-        say more.
-        Raises ``LocalProtocolError``: it cannot be sent; nothing was; ``WorkerError``: the
-        environment is not in a state to take it.
+        ``instead`` makes the messages to send; those of ``message_for`` are only recorded then.
+        Raises ``LocalProtocolError``: it cannot be sent, and nothing was; ``WorkerError``: the
+        environment's state does not permit it.
         """
         if self.before_request is not None:
             self.before_request()
@@ -327,7 +320,7 @@ class Requests(RequestOrder):
     def make_ready(self, operation: str, start: Callable[[], object] | None = None) -> None:
         """With the lock held, open the jail if there is none; raises as ``submit`` does.
 
-        ``start`` does so, or raises why it could not, where that was begun already.
+        ``start`` gives the result of a start that was tried already: it returns, or raises.
         """
         with self._sending(operation):
             if start is not None:
@@ -338,7 +331,7 @@ class Requests(RequestOrder):
     def pack(
         self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
     ) -> Packed:
-        """The first half of ``submit``: nothing is sent. Raises ``LocalProtocolError``."""
+        """Encode a request without sending it. Raises ``LocalProtocolError``."""
         lane = self._lane()
         request = self._request(lane, operation, message_for)
         sent = request if instead is None else self._request(lane, operation, instead)
@@ -358,8 +351,9 @@ class Requests(RequestOrder):
             self._prewarm.note_use()
 
     def submit_alone(self, lane: Lane, operation: str, message: m.Message) -> None:
-        """With the lock held, send the only runner of ``lane`` a request, while other runners, or
-        it, may owe answers to earlier ones; raises as ``submit`` does.
+        """With the lock held, send a request over a lane to one runner; raises as ``submit`` does.
+
+        Answers to earlier requests may still be owed, by this runner and by others.
         """
         ready = self.lifecycle.state is State.READY  # otherwise a request is pending already
         with self._sending(operation), self._outgoing(operation, submit=ready):
@@ -371,7 +365,7 @@ class Requests(RequestOrder):
         return lane.jail.request(operation, messages, bounds)
 
     def refuse_whole(self, operation: str, message_for: MessageFor, count: int) -> None:
-        """Raise what cannot be sent as it is called in the caller's arguments, not in a shard's."""
+        """Raise ``LocalProtocolError`` with the position in all of the caller's arguments."""
         lane = self._lane()
         lane.jail.request(operation, [message_for(lane.number, (0, count))], [(0, count)])
 
@@ -381,8 +375,8 @@ class Requests(RequestOrder):
         kind: type[m.M] | tuple[type[m.M], ...],
         lane: Lane | None = None,
     ) -> list[m.M]:
-        """With the lock held, the shards' replies to the last ``submit``; those that are owed to
-        ``lane`` after ``submit_alone``.
+        """With the lock held, wait for the shards' replies to the last request; after
+        ``submit_alone`` for those that are owed to its ``lane``.
         Raises ``WorkerTimeoutError``: the environment is then LATE: ``reset`` brings it back;
         ``WorkerDiedError``: the environment is then DEAD; with ``restart="transparent"`` READY;
         ``RemoteEnvError``: the repository's code raised; the environment is still usable;
@@ -424,7 +418,7 @@ class Requests(RequestOrder):
     def finish_reset(
         self, replies: list[m.ResetDone], timeout: float | Deadline | None
     ) -> tuple[Any, dict[Any, Any]]:
-        """What ``VectorEnv.reset`` returns, of the replies to one; raises as ``collect`` does."""
+        """Turn replies into what ``VectorEnv.reset`` returns; raises as ``collect`` does."""
         with self._incoming():
             try:
                 result = self.results.reset(replies)
@@ -441,7 +435,7 @@ class Requests(RequestOrder):
     def submit_step(self, actions: Any, packed: Packed | None = None) -> None:
         """Send a validated batch of actions, with the lock held; raises as ``submit`` does.
 
-        ``packed``: of them, where they have no fixed layout and were packed already.
+        ``packed`` is the request, if it was encoded already because the actions have no layout.
         """
         if self.before_request is not None:
             self.before_request()
@@ -472,7 +466,7 @@ class Requests(RequestOrder):
             raise
 
     def takes_more(self) -> bool:
-        """Whether ``submit_ahead`` may be called while a step is pending; it is wanted."""
+        """Whether ``submit_ahead`` may be called now; asks the lane to permit it next time."""
         if self.lifecycle.state is not State.PENDING:
             return False
         lane = self._lane()
@@ -480,9 +474,9 @@ class Requests(RequestOrder):
         return lane.takes_more
 
     def submit_ahead(self, actions: Any) -> None:
-        """Send a further step before the answer to the last; raises as ``submit_step`` does.
+        """Send a step before the last one is answered; raises as ``submit_step`` does.
 
-        The answer to that is collected first, and ``owe`` called after it.
+        After that answer is collected, ``owe`` must be called.
         """
         with self.use.hold("step"):
             self._lane().send_step(actions, ahead=True)
@@ -490,7 +484,7 @@ class Requests(RequestOrder):
             self._recorder.step(actions)
 
     def owe(self, operation: str = "step") -> None:
-        """After an answer: what was sent besides is pending now."""
+        """After an answer, note that a request that was sent ahead is pending now."""
         self.lifecycle.request = operation
         self.lifecycle.moved(Event.SUBMIT)
 
@@ -524,7 +518,7 @@ class Requests(RequestOrder):
         return result
 
     def _mended(self, error: BaseException, deadline: Deadline) -> StepResult:
-        """The step's results, where infos do not fit together or a ``Recovery`` helps."""
+        """The results of a step whose infos do not fit together, or whose runners died."""
         if isinstance(error, batches.Misfit):
             return self._lane().result(self._infos_apart(deadline))
         if not isinstance(error, RunnersDiedError):
@@ -539,7 +533,7 @@ class Requests(RequestOrder):
             return self.results.step(done, self._recovery.mark(infos))
 
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
-        """The last infos once more, of shards whose infos do not fit together."""
+        """Fetch the last infos again, one by one, since those of shards do not fit together."""
         own = self.own_infos(deadline)
         try:
             return self.results.joined_own(own)
@@ -548,9 +542,9 @@ class Requests(RequestOrder):
             raise
 
     def own_infos(self, deadline: Deadline, *, failed: bool = False) -> list[m.Value]:
-        """The last infos of each sub-environment as it gave them, by shards.
+        """Fetch the last infos of each sub-environment as it gave them, by shards.
 
-        ``failed`` tells them that those could not be joined; then there are none.
+        ``failed`` tells the runners instead that these could not be joined.
         """
         lane = self._lane()
         with self._outgoing("step"):
@@ -563,7 +557,7 @@ class Requests(RequestOrder):
         return all_replies(replies, m.Value)
 
     def checked_own_infos(self, deadline: Deadline, *, failed: bool = False) -> list[m.Value]:
-        """``own_infos`` of one worker of several: one that gives those of others is given up."""
+        """``own_infos`` of one worker of several, which is given up if it sends infos of others."""
         with self.use.judging("a request"):
             replies = self.own_infos(deadline, failed=failed)
             self.results.own_pairs(replies)
@@ -573,9 +567,7 @@ class Requests(RequestOrder):
 
     @contextmanager
     def _sending(self, operation: str) -> Iterator[None]:
-        """Around the preparation and the sending of a request: an error that a ``close`` in another
-        thread has caused says so.
-        """
+        """Prepare and send a request: an error caused by a ``close`` in another thread says so."""
         try:
             try:
                 yield
@@ -590,7 +582,7 @@ class Requests(RequestOrder):
 
     @contextmanager
     def _outgoing(self, operation: str, *, submit: bool = True) -> Iterator[None]:
-        """Around the sending of a message; ``submit`` unless another request is pending."""
+        """Send a message; ``submit`` unless another request is pending."""
         if submit:
             self.lifecycle.request = operation
             self.lifecycle.on(Event.SUBMIT)  # interruption.md, rule 1: first
@@ -604,7 +596,7 @@ class Requests(RequestOrder):
 
     @contextmanager
     def _incoming(self) -> Iterator[None]:
-        """Around the handling of replies: a worker that breaks a rule in them is given up."""
+        """Handle replies: a worker that breaks a rule in them is given up."""
         try:
             yield
         except BaseException:
@@ -625,7 +617,7 @@ class Requests(RequestOrder):
         self._prewarm.start_on_demand()
 
     def _nothing_was_sent(self, error: BaseException) -> None:
-        """Go back to where we were, if nothing was sent: interruption.md, rule 2."""
+        """Restore the state if nothing was sent: interruption.md, rule 2."""
         if isinstance(error, EnvHubError) and self.lifecycle.state is State.PENDING:
             self.lifecycle.answered()
 
@@ -639,7 +631,7 @@ class Requests(RequestOrder):
         return WorkerError(f"there is no request to wait for: the environment is {state}")
 
     def _finish(self, receive: Callable[[Deadline], T], deadline: Deadline) -> T:
-        """Wait for the pending reply, and move on to the state that it leads to."""
+        """Wait for the pending reply, and move to the state that follows."""
         try:
             received = receive(deadline)
         except RunnersDiedError:
@@ -655,7 +647,7 @@ class Requests(RequestOrder):
         return received
 
     def _failed(self, error: EnvHubError, deadline: Deadline) -> NoReturn:
-        """Raise what a wait has ended in, and move on to the state that it leads to."""
+        """Raise the error that ended a wait, and move to the state that follows."""
         failures, operation = self._failures, self.lifecycle.request or "a request"
         if isinstance(error, WorkerDiedError) and error.reason == "connection":
             self._lease.note_lost()

@@ -17,15 +17,15 @@ from envhub_worker.protocol.errors import blamed, is_fault
 from envhub_worker.protocol.lifecycle import State
 
 _AT_ONCE = 8
-"""Locks that one ``with`` takes."""
+"""How many locks one ``with`` takes."""
 
 
 @contextmanager
 def all_held(locks: Sequence[threading.RLock]) -> Iterator[None]:
     """Hold several locks, taken in their order.
 
-    By statements, between whose taking and noting no Ctrl-C comes. Eight at a time, and these in a
-    tree: each level costs a microsecond, and nesting is bounded.
+    A ``with`` statement takes and notes a lock without room for a Ctrl-C, so all are taken by such
+    statements, eight at a time; a tree of these keeps the nesting low.
     """
     if len(locks) > _AT_ONCE:
         middle = len(locks) // 2
@@ -67,7 +67,7 @@ class UseLock:
                 self._lease.let_go()
 
     def _after_close(self, operation: str, error: BaseException) -> None:
-        """What failed because of a ``close`` in its midst says so, and gives back what is left.
+        """After a ``close`` in the meantime, give back what is left.
         Raises ``WorkerDiedError``: it was closed, and the error does not say so.
         """
         if not self._lease.lifecycle.closed:
@@ -78,9 +78,8 @@ class UseLock:
 
     @contextmanager
     def judging(self, operation: str) -> Iterator[None]:
-        """Hold the lock to handle replies: a worker that breaks a rule in them is given up.
-        Raises ``RemoteProtocolError``: it did, whatever the handling raised; the environment is
-        then DEAD.
+        """Hold the lock to handle replies.
+        Raises ``RemoteProtocolError``: the worker broke a rule in them; the environment is DEAD.
         """
         with self.hold(operation):
             try:
@@ -100,7 +99,7 @@ class UseLock:
             self._failures.dead(error)
 
     def abandon(self) -> None:
-        """In a fork, which has not the thread that held the lock: interruption.md, rule 14."""
+        """In a fork, the thread that held the lock does not exist: interruption.md, rule 14."""
         self.lock = threading.RLock()
         self.flight = threading.RLock()
 
@@ -114,10 +113,9 @@ class FleetUse:
 
     @property
     def lock(self) -> AbstractContextManager[None]:
-        """The locks of all parts, taken in their order: interruption.md, rule 16.
+        """The locks of all parts, in their order, for one ``with``: interruption.md, rule 16.
 
-        A fresh one for each ``with``: where a Ctrl-C comes into it, the locks are released with
-        that object at the latest.
+        After a Ctrl-C, they are released at the latest when this object goes.
         """
         return self.hold([part.lock for part in self._parts])
 

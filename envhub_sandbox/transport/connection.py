@@ -36,7 +36,7 @@ _NOW = int(zmq.NOBLOCK)
 _MORE_NOW = int(zmq.SNDMORE) | _NOW
 _EVENTS, _READABLE = int(zmq.EVENTS), int(zmq.POLLIN)
 _KILLED_IN_A_CONTAINER = 128
-"""And the signal's number: an engine's exit code, where the container's program got one."""
+"""Added to a signal's number, this is an engine's exit code for a container that was killed."""
 _SIGKILL = 9
 SESSION = secrets.token_bytes(16)
 Source = Any
@@ -63,9 +63,9 @@ def _context() -> zmq.Context[zmq.Socket[bytes]]:
 
 
 _LOOK_MS = 500
-"""One wait on a connection over a network: whether it is still there is asked in between."""
+"""The longest single wait on a network connection, before its state is checked."""
 _ROOM_S = 30.0
-"""How long a socket may be full, or without a connection, until what is sent counts as lost."""
+"""How long a socket may be full or unconnected before a message counts as lost."""
 
 
 class FarServer(Protocol):
@@ -188,8 +188,8 @@ class WorkerConnection:
         self.sent_bytes += size
 
     def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Buffer]]:
-        """The reply to a request, with its payload. Replies to others are dropped and counted,
-        unless they are to be kept.
+        """The reply to a request, with its payload. Other replies are dropped and counted, unless
+        ``keep`` was called for them.
         Raises ``WorkerTimeoutError``: the deadline came first, and a reply that still comes is
         dropped; ``WorkerDiedError``: the worker server has ended, or the connection to it is lost;
         ``SandboxUnavailableError``: a server on another host does not let us in;
@@ -252,11 +252,11 @@ class WorkerConnection:
         return (None, []) if arrived is None or isinstance(arrived, EnvHubError) else arrived
 
     def keep(self, request_id: int) -> None:
-        """Keep its reply where it comes before another one that is waited for."""
+        """Keep the reply to this request, if it comes before another one that is waited for."""
         self._kept.add(request_id)
 
     def forget(self, request_id: int) -> None:
-        """Its reply is not wanted any more, whether or not it has ``arrived``."""
+        """Drop the reply to this request, whether or not it has ``arrived``."""
         self._kept.discard(request_id)
         self._arrived.pop(request_id, None)
 
@@ -265,9 +265,8 @@ class WorkerConnection:
         return [source for source, _ in self._poller.sockets]
 
     def reply_again(self, request_id: int, deadline: Deadline) -> m.Message:
-        """The reply to a request, whose wait was interrupted before or after it came.
-
-        Without its payload; raises as ``receive`` does.
+        """The reply to a request whose wait was interrupted, before or after it came, without its
+        payload; raises as ``receive`` does.
         """
         if self._latest:
             reply_id, reply = m.unpack_header(self._latest, limits=self._limits)
@@ -293,9 +292,9 @@ class WorkerConnection:
                 return
 
     def _wait_for_room(self, deadline: Deadline) -> None:
-        """Until the socket takes a message. A refused handshake leaves it with nowhere to put one.
+        """Wait until the socket takes a message.
 
-        To send and wait for that, as libzmq does unasked, would be to wait for ever.
+        libzmq's own wait has no end after a refused handshake, which leaves no peer to send to.
         """
         while not self._socket.poll(min(_LOOK_MS, deadline.left_ms() or 0), zmq.POLLOUT):
             if self._process_fd in dict(self._poller.poll(0)):
@@ -311,7 +310,7 @@ class WorkerConnection:
         return WorkerDiedError(text, reason="server")
 
     def _take(self) -> list[Buffer]:
-        """The message that is there. What is large stays in ZeroMQ's memory until it is decoded."""
+        """Read the message. Large frames stay in ZeroMQ's memory until they are decoded."""
         frames: list[Buffer] = []
         more = True
         while more:
@@ -321,7 +320,7 @@ class WorkerConnection:
         return frames
 
     def _must_say_hello(self, request_id: int, reply: m.Message) -> bool:
-        """Whether we came back over a new connection: nothing was done, so it can be asked anew."""
+        """Whether the request came over a new connection and was refused, so it can be repeated."""
         unknown = isinstance(reply, m.Refusal) and reply.error == "HelloError"
         return unknown and request_id in self._sent
 
@@ -333,7 +332,7 @@ class WorkerConnection:
                 raise WorkerTimeoutError("the worker did not answer in time")
 
     def _is_readable(self, request_id: int, wait_ms: int | None) -> bool:
-        """Whether a message is there; raises why no reply to this request can come."""
+        """Whether there is a message; raises the error if no reply to this request can come."""
         ready = dict(self._poller.poll(wait_ms))
         if self._socket in ready:
             return True
@@ -350,7 +349,7 @@ class WorkerConnection:
         return _LOOK_MS if left is None else min(left, _LOOK_MS)
 
     def hold(self, jail: int) -> None:
-        """A jail on another host is ours: keep-alive messages name it."""
+        """Name a jail on another host in keep-alive messages from now on."""
         if self._far is not None:
             self._far.held.add(jail)
 
@@ -360,9 +359,7 @@ class WorkerConnection:
             self._far.held.discard(jail)
 
     def check_process(self) -> None:
-        """Refuse in a forked child: the connection belongs to the parent.
-        Raises ``WorkerError``: this is not the process that made the connection.
-        """
+        """Raise ``WorkerError`` in a fork: the connection belongs to the parent."""
         if os.getpid() != self._owner.pid:
             raise WorkerError(fork_error_text(self._owner.pid))
 

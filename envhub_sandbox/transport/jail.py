@@ -46,14 +46,14 @@ Unpack = Callable[[int, Frames], Any]
 
 
 class Request:
-    """What each shard is sent: made and encoded once, for the lane, the history and a recovery.
+    """Messages to all shards, encoded once for the lane, the history and a recovery.
 
     Args:
         operation: What the user called.
         messages: One for each shard.
         frames: Those of each message.
         bounds: The slices of the sub-environments, one for each shard.
-        plain: Whether there is nothing in them that only pickle could carry.
+        plain: Whether no value in them had to be pickled.
     """
 
     __slots__ = ("_kept", "bounds", "frames", "messages", "operation", "plain")
@@ -132,13 +132,13 @@ class JailHandle:
         return started
 
     def keep(self, deadline: Deadline) -> None:
-        """From now on it goes on without a runner that dies."""
+        """Keep the jail when a runner dies."""
         reply, _ = self.client.request(m.KeepJail(self.number), deadline=deadline)
         expect_reply(reply, m.Done)
         self.kept = True
 
     def expire(self, idle_s: float, deadline: Deadline) -> None:
-        """From now on it ends once it has been idle for so long."""
+        """End the jail once it has been idle for so long."""
         message = m.ExpireIdle(self.number, max(1, int(idle_s * 1000)))
         expect_reply(self.client.request(message, deadline=deadline)[0], m.Done)
 
@@ -209,7 +209,7 @@ class JailHandle:
             return [unpack(index, part) for index, part in enumerate(parts)]
 
     def arrived(self, request_id: int) -> list[Frames]:
-        """What has arrived of each runner, and is not taken yet; nothing where that is an error."""
+        """The frames that have arrived from each runner and are not taken; none for an error."""
         reply, payload = self.client.peek(request_id)
         if type(reply) is not m.RelayDone:
             return []
@@ -221,12 +221,12 @@ class JailHandle:
         return parts if len(parts) == self._asked.get(request_id) else []
 
     def forget(self, request_id: int) -> None:
-        """What the runners answer is not wanted any more."""
+        """Drop the runners' answers to a request."""
         self._asked.pop(request_id, None)
         self.client.forget(request_id)
 
     def _died(self, dead: Sequence[int], parts: list[Frames], unpack: Unpack) -> RunnersDiedError:
-        """The server says which runners have died; a runner cannot."""
+        """The deaths that the server reports, which a runner cannot."""
         if not dead or not set(dead) <= set(range(len(parts))):
             raise RemoteProtocolError("the worker names dead runners that were not asked")
         messages = {index: self._unpack(index, parts[index]) for index in dead}
@@ -331,16 +331,13 @@ def _cut(payload: Frames, counts: Sequence[int]) -> list[Frames]:
 
 
 def _nothing() -> None:
-    """What it prints is not followed."""
+    """Do nothing: the jail's output is not followed."""
 
 
 def open_jail(
     client: WorkerConnection, request: m.OpenJail, limits: WireLimits, deadline: Deadline
 ) -> JailHandle:
-    """Open a jail.
-    Raises ``SandboxUnavailableError``: a layer of the confinement is missing; ``WorkerDiedError``:
-    it did not come up.
-    """
+    """Open a jail. Raises ``SandboxUnavailableError``: a layer is missing; ``WorkerDiedError``."""
     sent = client.send(request)
     try:
         reply, _ = client.receive(sent, deadline)

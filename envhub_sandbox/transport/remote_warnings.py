@@ -74,9 +74,8 @@ class RemoteWarnings:
         self.unshown.append(warning if len(shown) <= MOST else _NO_MORE)
 
     def show(self, label: str) -> None:
-        """Show those that are new, with the line of the caller's own code.
-        Raises ``RemoteEnvWarning``: a filter of the caller's says so. The rest is shown the next
-        time.
+        """Show new warnings, at the line of the caller's own code.
+        Raises ``RemoteEnvWarning``: a filter of the caller's wants it; the rest is shown later.
         """
         while self.unshown:
             try:
@@ -89,7 +88,7 @@ class RemoteWarnings:
 
 
 def level_of_the_caller() -> int:
-    """How far up the first frame lies that is none of this package, as ``warnings.warn`` counts."""
+    """The ``stacklevel`` of the first frame outside of this package."""
     frame, level = sys._getframe(1), 1
     while frame.f_back is not None and _is_ours(frame.f_globals.get("__name__")):
         frame, level = frame.f_back, level + 1

@@ -37,7 +37,7 @@ _PROFILE = 'profile "(strict|no-userns|container)"'
 
 
 class UnreachableError(SandboxUnavailableError):
-    """There is no server, or it goes just now: as far as one can tell, for it has said nothing."""
+    """There is no server, or it is just ending: it has said nothing."""
 
 
 class RunnersDiedError(WorkerDiedError):
@@ -66,9 +66,9 @@ class RunnersDiedError(WorkerDiedError):
 
 
 def expect_reply(reply: m.Message, kind: type[m.M]) -> m.M:
-    """The reply, if it is of the kind that the request asks for.
-    Raises ``SandboxUnavailableError``: a layer of the confinement is missing; ``WorkerDiedError``:
-    a process of the jail ended; ``RemoteProtocolError``: it is another message.
+    """The reply, which must be of this kind.
+    Raises ``RemoteProtocolError``: it is another message; or the error that a refusal or a death
+    means.
     """
     if isinstance(reply, m.Refusal) and kind is not m.Refusal:
         raise refusal(reply)
@@ -78,9 +78,8 @@ def expect_reply(reply: m.Message, kind: type[m.M]) -> m.M:
 
 
 def check_reply(reply: m.Message) -> None:
-    """Raise what a runner's reply says went wrong.
-    Raises ``EnvHubError``: what the repository raised; ``RemoteProtocolError``: a runner spoke in
-    the server's name.
+    """Raise what the repository raised, by a runner's reply.
+    Raises ``RemoteProtocolError``: the runner sent a message of the server's.
     """
     if isinstance(reply, m.RaisedException):
         raise raised(reply)
@@ -89,9 +88,7 @@ def check_reply(reply: m.Message) -> None:
 
 
 def typed_reply(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.M:
-    """The reply, if it is of the kind, or of one of the kinds, that the request asks for.
-    Raises ``RemoteProtocolError``: it is another message.
-    """
+    """The reply, which must be of this kind, or of one of these. Raises ``RemoteProtocolError``."""
     if isinstance(reply, kind):
         return reply
     kinds = kind if isinstance(kind, tuple) else (kind,)

@@ -31,14 +31,13 @@ class Results:
 
     Attributes:
         manifest, bounds: As given.
-        count: How many sub-environments these are: all, or those of one worker of a fleet.
+        count: The number of sub-environments: all, or those of one worker of a fleet.
         slices: The same as ``bounds``, counted from the first of these.
-        apart: Whether infos are to come as each sub-environment gave them, under its place; what
-            began in the step that ended an episode, under ``count`` more. The environment is then
-            built for that.
-        looks_inside: Whether more is checked of an observation than its classes, dtypes and shapes,
-            or made of it.
-        max_bytes: How much larger than what the workers sent their infos may be when joined.
+        apart: Whether infos come as each sub-environment gave them, under its index; infos of an
+            episode that began in the same step, under the index plus ``count``.
+        looks_inside: Whether the values of observations are checked or changed here, and not only
+            their classes, dtypes and shapes.
+        max_bytes: How much larger than their messages the workers' infos may be when joined.
     """
 
     def __init__(self, manifest: EnvManifest, bounds: Sequence[tuple[int, int]]) -> None:
@@ -56,9 +55,8 @@ class Results:
         self.looks_inside = self._declared or self._restores
 
     def step(self, replies: list[m.StepDone], infos: dict[Any, Any] | None = None) -> StepResult:
-        """What ``VectorEnv.step`` returns; with these infos, if there are other ones.
-        Raises ``Misfit``: the shards' infos do not go together; the others are what ``joined_own``
-        makes.
+        """What ``VectorEnv.step`` returns, with these infos instead of the replies', if given.
+        Raises ``Misfit``: the shards' infos do not fit together; ``joined_own`` makes others.
         """
         return (
             self._observation([reply.observation for reply in replies]),
@@ -71,7 +69,7 @@ class Results:
     def joined_steps(
         self, parts: Sequence[StepResult], infos: dict[Any, Any] | None = None
     ) -> StepResult:
-        """One result of those of slices, each of which was held against its own; as ``step``."""
+        """Join the results of workers, each of which was checked; as ``step``."""
         observations, rewards, terminations, truncations, own = zip(*parts, strict=True)
         if len({part.shape[1:] for part in rewards}) > 1:
             raise RemoteProtocolError("the workers sent rewards of different shapes")
@@ -86,7 +84,7 @@ class Results:
     def joined_resets(
         self, parts: Sequence[tuple[Any, dict[Any, Any]]], infos: dict[Any, Any] | None = None
     ) -> tuple[Any, dict[Any, Any]]:
-        """Likewise of a reset."""
+        """Join the workers' results of a reset."""
         observations, own = zip(*parts, strict=True)
         joined = self._joined_infos(own) if infos is None else infos
         return batches.join(self._space, observations), joined
@@ -108,8 +106,8 @@ class Results:
         return observation, infos
 
     def joined_own(self, replies: list[m.Value]) -> dict[Any, Any]:
-        """One mapping of the sub-environments' own infos, joined here as Gymnasium does it.
-        Raises ``RemoteEnvError``: it would raise in Gymnasium, too.
+        """Join the sub-environments' own infos as Gymnasium does.
+        Raises ``RemoteEnvError``: Gymnasium would raise, too.
         """
         own = self.own_pairs(replies)
         forms = [form for _, _, form in own]
@@ -129,10 +127,8 @@ class Results:
         return self._restored(infos)
 
     def own_pairs(self, replies: list[m.Value]) -> list[OwnInfo]:
-        """Those infos, each with the place of its sub-environment and its forms.
-
-        Trust: input from the worker.
-        Raises ``RemoteProtocolError``: they are of others, or none.
+        """Those infos, each with its sub-environment's index and its forms.
+        Raises ``RemoteProtocolError``: they are of others, or none. Trust: input from the worker.
         """
         pairs: list[OwnInfo] = []
         start = 0
@@ -185,10 +181,8 @@ class Results:
         return own
 
     def own(self, infos: dict[Any, Any]) -> Own:
-        """Infos that came apart; and of the only sub-environment, which members of the observation
-        are Python's, and a reward that is no number, if there is one.
-
-        Trust: input from the worker.
+        """Infos that came apart; for a single sub-environment also which members of its observation
+        are numbers of Python, and a reward that is no number. Trust: input from the worker.
         """
         places = sorted(key for key in infos if type(key) is int and key >= 0)
         scalars, reward = infos.get(batches.APART_SCALARS, ()), infos.get(batches.APART_REWARD, ())
@@ -216,9 +210,7 @@ class Results:
         return infos
 
     def info(self, reply: m.Message | None) -> dict[Any, Any]:
-        """A shard's infos, out of what it said of them; nothing at all is none.
-        Raises ``RemoteEnvError``: the environment raised.
-        """
+        """A shard's infos from its reply; empty for None. Raises ``RemoteEnvError``: it raised."""
         if reply is None:
             return {}
         [answer] = all_replies([reply], m.Value)
@@ -257,7 +249,7 @@ class Results:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _is_own(self, name: str, part: Any) -> bool:
-        """Whether our own vector environments have such: it may be joined with that of others."""
+        """Whether our own vector environments return such arrays, which can be joined."""
         if name != "rewards":
             return _flags(part)
         # several for each sub-environment are what AsyncVectorEnv permits
@@ -278,9 +270,9 @@ def _own_infos(value: Any, size: int) -> Sequence[OwnInfo]:
 
 
 def all_replies(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:
-    """The shards' replies, all of the kind, or of one of the kinds, that was asked for.
-    Raises ``EnvHubError``: what the repository raised; that comes before a wrong message of another
-    shard; ``RemoteProtocolError``: a message is another one.
+    """The shards' replies, which must be of this kind, or of one of these.
+    Raises ``EnvHubError``: the repository raised, in any of the shards; ``RemoteProtocolError``: a
+    message is of another kind.
     """
     others = [reply for reply in replies if type(reply) is not kind]
     for reply in others:

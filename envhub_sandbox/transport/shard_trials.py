@@ -26,9 +26,9 @@ from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.batches import even_bounds
 
 LEAST_STEPS = 32
-"""A shorter use says nothing about speed."""
+"""Fewer steps say nothing about speed."""
 ENOUGH_STEPS = 512
-"""After so many it is noted how long they took, and once more at the end."""
+"""After so many steps their time is noted, and once more at the end."""
 _NEARLY = 1.03
 """So much slower counts as equal."""
 HOPELESS = 1.2
@@ -51,9 +51,8 @@ class ShardTrials:
         self._cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
 
     def bounds_for(self, env: EnvManifest, num_workers: int | None) -> Bounds:
-        """The slices of the sub-environments, one for each shard.
-        ``env``: what the environment is.
-        ``num_workers``: as many shards, if they can be had; None for as many as are useful.
+        """The slices of the sub-environments, one for each of ``num_workers`` shards, or of as
+        many as are useful.
         """
         if not env.shardable or (num_workers is None and env.sync):
             return even_bounds(env.num_envs, 1)

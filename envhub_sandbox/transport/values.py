@@ -144,16 +144,14 @@ _SHOWN = 200
 
 
 class DescriptionReader:
-    """What one message describes, out of one budget: all of it costs no more than its bytes may.
-    ``limits``: what the message may hold.
-    """
+    """Makes what one message describes, within one budget for all of it: the message's bytes."""
 
     def __init__(self, limits: WireLimits) -> None:
         self._reader = SpaceReader(limits.message_bytes // ELEMENT_BYTES, generator=generator)
 
     def __call__(self, code: int, value: object) -> object:
-        """The thing that is described. Trust: input from the worker.
-        Raises ``RemoteProtocolError``: there can be none like it, or it costs too much.
+        """Make what is described. Trust: input from the worker.
+        Raises ``RemoteProtocolError``: it is impossible, or costs too much.
         """
         if code == SPACE:
             return self._reader.space(value)
@@ -178,10 +176,9 @@ def _spec(value: object) -> Any:
 
 
 def spec_of(description: dict[str, Any] | None) -> EnvSpec | None:
-    """A spec with these facts, as ``read_spec`` lets them through.
+    """A spec with facts that ``read_spec`` has checked; None if this Gymnasium takes no such id.
 
-    A string names what refuses, so that it can be written as JSON like any other.
-    ``description``: ``id``, ``max_episode_steps``, ``reward_threshold``, ``nondeterministic``.
+    Its entry points are texts, so that it can be written as JSON, and name what refuses.
     """
     # gym.make imports what stands before a colon
     if not description or description.get("id") is None or ":" in description["id"]:
@@ -194,9 +191,7 @@ def spec_of(description: dict[str, Any] | None) -> EnvSpec | None:
 
 
 def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
-    """What ``gym.make`` calls with the spec of a sub-environment, or one in an info.
-    Raises ``gymnasium.error.Error``: always.
-    """
+    """Raise ``gymnasium.error.Error``: the entry point of specs that a worker describes."""
     named = f", {reference}" if reference else ""
     raise gym.error.Error(
         f"this describes an environment in a sandbox{named}, whose code never enters this process. "
@@ -205,11 +200,9 @@ def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
 
 
 def pickled(value: object, *, lasting: bool = False) -> bytes:
-    """What the jail makes the same value of; a class of ``__main__`` travels along.
-    ``value``: one that the wire has no form for.
-    ``lasting``: whether the bytes must say all there is to it: no code of the caller's own is named
-    in them.
-    Raises ``TypeError``: such code is named; who knows what it is by the next time.
+    """Pickle a value of the caller's for the jail, with classes of ``__main__``.
+    ``lasting``: whether the bytes must say everything, without names of the caller's own code.
+    Raises ``TypeError``: a ``lasting`` value has such code, which may differ the next time.
     """
     buffer = io.BytesIO()
     pickler = _pickler()(buffer)
@@ -232,10 +225,7 @@ def _pickler() -> Any:
         lasting: bool
 
         def reducer_override(self, value: Any) -> Any:
-            """A view of memory, which pickle knows nothing of, is one of a copy.
-
-            Of classes and functions a pickle has the names only, so these are judged.
-            """
+            """Pickle a memory view as one of a copy; refuse names that do not last."""
             if self.lasting and isinstance(value, (type, FunctionType)):
                 package = str(value.__module__).partition(".")[0]
                 if package not in _INSTALLED and package not in sys.stdlib_module_names:

@@ -30,11 +30,11 @@ _PYTHONS = {np.dtype(kind): kind for kind in (bool, int, float)}
 
 
 class UniterableError(ActionTypeError, CustomSpaceError):
-    """A scalar for several members of a space that is no array: which Gymnasium raises there."""
+    """A scalar in place of several members of a space without arrays, as Gymnasium raises it."""
 
 
 class SeedError(TypeError, Error):
-    """A seed that is no integer of Python's, which neither Gymnasium's environments take."""
+    """A seed that is no Python integer; Gymnasium's environments refuse it, too."""
 
     def __init__(self, seed: object) -> None:
         super().__init__(f"Seed must be a python integer, actual type: {type(seed)}: use int(seed)")
@@ -42,13 +42,10 @@ class SeedError(TypeError, Error):
 
 @singledispatch
 def batch_of(space: gym.Space[Any], value: Any, count: int | None, where: str = "actions") -> Any:
-    """A batch of ``count`` members of a *single* action space.
-    ``count``: none where the space is that of the whole batch.
-    ``where``: what to call it in an error.
+    """A batch of ``count`` members of a *single* action space; of a batched one for None.
 
-    Returns:
-        Arrays of shape ``(count, *space.shape)``, in dicts and tuples as the space has them; in
-        place of an array, a list of so many numbers of Python, or of lists of them.
+    Returns arrays of shape ``(count, *space.shape)``, in dicts and tuples as the space has them, or
+    lists of Python's numbers in place of arrays. ``where`` is the batch's name in errors.
     Raises ``ActionError``: a wrong shape, dtype or structure.
     """
     if count is None:
@@ -120,8 +117,8 @@ def _batch_of_tuples(
 
 
 def action_reader(manifest: EnvManifest, count: int) -> Callable[[Any], Any]:
-    """Checks a batch of so many actions and makes it what the worker takes. Trust: a manifest is
-    input from the worker.
+    """A function that checks a batch of ``count`` actions and makes it what the worker takes.
+    Trust: a manifest is input from the worker.
     """
     single, own = manifest.single_action_space, manifest.own_batch("action_space")
     if isinstance(single, OpaqueSpace):
@@ -219,7 +216,7 @@ def _shape(space: gym.Space[Any], count: int | None) -> tuple[int, ...]:
 
 
 def _is_listed(value: Any, array: Any) -> bool:
-    """Whether the array's ``tolist`` gives just this back: lists of numbers of one class."""
+    """Whether ``array.tolist()`` equals the value: lists of numbers of one class."""
     kind = _PYTHONS.get(array.dtype)
     if kind is None or type(value) not in (list, tuple):
         return False

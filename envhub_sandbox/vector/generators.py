@@ -27,7 +27,7 @@ from envhub_worker.protocol.spaces.spaces import BIT_GENERATORS
 
 _NUMBER = "number"
 _SAID_NEXT = (WorkerError, RemoteEnvError, AlreadyPendingCallError, ClosedEnvironmentError)
-"""What must not hide the answer to a request, and is raised by the next one; of other threads'."""
+"""Errors of reading generators that must not hide a request's answer; the next one raises them."""
 
 
 class _Live:
@@ -35,9 +35,8 @@ class _Live:
 
     Attributes:
         generator: The caller's.
-        number: What the worker calls its generator: another one, another number. None before it
-            is known.
-        known: The state that both had last.
+        number: The worker's number of its generator object; None before it is known.
+        known: The last state that both had.
     """
 
     def __init__(self, generator: np.random.Generator, number: int | None) -> None:
@@ -46,7 +45,7 @@ class _Live:
         self.known = generator.bit_generator.state
 
     def drawn(self) -> dict[str, Any] | None:
-        """The state that the caller has brought it to; None where that is the known one."""
+        """Its state if the caller has drawn from it; None otherwise."""
         state: Any = self.generator.bit_generator.state
         return None if _equal(state, self.known) else state
 
@@ -56,7 +55,7 @@ class _Live:
 
 
 _UNKEPT = _Live(np.random.Generator(np.random.PCG64(0)), 0).references()
-"""The references of a generator that nobody else has."""
+"""The references to a generator that only this module has."""
 
 
 class Generators:
@@ -119,7 +118,7 @@ class Generators:
             self.write(states)
 
     def after_request(self) -> None:
-        """Bring those up to date that the caller has kept."""
+        """Update the generators that the caller has kept."""
         if self._current or self._asking or self._requests.waiting is not None:
             return
         if any(live.references() != _UNKEPT for live in self._live):
@@ -158,7 +157,7 @@ def _read(value: Any) -> _Live:
 
 
 def _followed(old: _Live, new: _Live) -> _Live:
-    """The caller's generator in its new state; another one, where the environment has another."""
+    """The caller's generator in its new state, or a new one if the environment has another."""
     bits, fresh = old.generator.bit_generator, new.generator.bit_generator
     if old.number not in (None, new.number) or type(bits) is not type(fresh):
         return new

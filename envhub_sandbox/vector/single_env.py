@@ -29,7 +29,7 @@ from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.spaces import batches
 
 _DECLARED = frozenset({"action_space", "observation_space", "metadata", "render_mode"})
-"""What is known of the environment without a request; set here and there."""
+"""Attributes that are known without a request; set here and in the environment."""
 _OURS = frozenset(
     {"_apart", "_begun", "_close", "_observations", "_resets_in_the_same_step", "_spec", "_vector"}
 )
@@ -202,10 +202,9 @@ class SingleEnv(gym.Env[Any, Any]):
     @property
     @short_traceback
     def spec(self) -> Any:
-        """What was set here, or what ``gym.make`` makes the same of, in a sandbox again.
+        """What was set here, or a spec from which ``gym.make`` makes the same, in a sandbox.
 
-        Its limits are those of the environment's own spec, which is that of
-        ``env.vector.envs[0]``.
+        Its limits are those of the environment's own spec, ``env.vector.envs[0].spec``.
         """
         if "_spec" not in self.__dict__:
             self._spec = self._own_spec()

@@ -25,8 +25,8 @@ _OUTERMOST = 0
 _SEARCHED = -1
 """In place of a depth: whichever wrapper has it."""
 _MOST_WRAPPERS = 1000
-"""Around one environment; otherwise a search for the innermost might never end. As many as Python's
-nested calls, which a step through the wrappers makes."""
+"""Wrappers around one environment, which otherwise might be endless: about as many as the nested
+calls that Python permits, of which a step makes one for each."""
 _OURS = frozenset({"_vector", "_index", "_depth"})
 
 
@@ -82,9 +82,7 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     @short_traceback
     def close(self) -> None:
-        """Close it, if there are no others.
-        Raises ``ValueError``: there are, and a vector environment cannot go on without one of them.
-        """
+        """Close it. Raises ``ValueError``: it is one of several, which cannot go on without it."""
         if self._vector.num_envs > 1:
             raise ValueError(
                 f"cannot close sub-environment {self._index} of {self._vector.num_envs}: the "
@@ -103,8 +101,7 @@ class SubEnvironment(gym.Env[Any, Any]):
     @short_traceback
     def env(self) -> Any:
         """What this wrapper wraps.
-        Raises ``AttributeError``: it is no wrapper; ``RemoteProtocolError``: there is no end to
-        them.
+        Raises ``AttributeError``: it is no wrapper; ``RemoteProtocolError``: they are endless.
         """
         if self._depth is not None and self._depth >= _MOST_WRAPPERS:
             raise RemoteProtocolError(f"the worker says that more than {_MOST_WRAPPERS} wrap one")

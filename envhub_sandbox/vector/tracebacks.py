@@ -28,10 +28,9 @@ T = TypeVar("T")
 
 
 def shortened(error: BaseException) -> bool:
-    """Remove the frames of an error, and say whether that was done: then raise it again.
+    """Remove the frames of an error; if this returns True, raise it again.
 
-    A protocol error keeps its frames, and so does an error of another package: there, the frames
-    say where to look.
+    Protocol errors and errors of other packages keep their frames, which say where to look.
     """
     if not _text_suffices(error) or os.environ.get(_VARIABLE) == _FULL:
         return False
@@ -71,7 +70,7 @@ def _text_suffices(error: BaseException) -> bool:
 
 
 def _shorten_causes(error: BaseException) -> None:
-    """Do the same to its causes, as far as they are errors of this project."""
+    """Remove the frames of its causes that are errors of this project."""
     cause = error.__cause__
     for _ in range(_CHAINED):
         if cause is None:

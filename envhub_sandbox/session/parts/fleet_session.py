@@ -50,12 +50,12 @@ from envhub_worker.protocol.spaces import batches
 
 T = TypeVar("T")
 _ENDS_S = 10.0
-"""How long starts are waited for that were interrupted, and so given up."""
+"""How long to wait for starts that were given up after an interrupt."""
 _WORST = (
     *(State.CLOSED, State.FOREIGN, State.DEAD, State.EXPIRED, State.LATE, State.REVIVING),
     *(State.PENDING, State.IDLE, State.READY),
 )
-"""Of several parts' states that of the first in this order counts for all."""
+"""The state of several parts is the first of theirs in this order."""
 
 
 class FleetSession:
@@ -84,7 +84,7 @@ class FleetSession:
         return len(self.parts)
 
     def report(self) -> list[dict[str, Any]]:
-        """The layers of every jail, each with the number of its worker."""
+        """The layers of every jail, with the number of its worker."""
         return [
             {**layer, "worker": number}
             for number, part in enumerate(self.parts)
@@ -143,8 +143,8 @@ class FleetSession:
         self.finalize()
 
     def finalize(self) -> None:
-        """Close every part, one after the other: a finalizer starts no thread, for the collector
-        may have called it where one is being started."""
+        """Close every part in turn. A finalizer starts no thread: the garbage collector may have
+        called it while one is being started."""
         with contextlib.ExitStack() as stack:  # interruption.md, rule 9
             for part in self.parts[::-1]:
                 stack.callback(part.close)
@@ -306,8 +306,8 @@ class FleetRequests(RequestOrder):
         self._recorder.step(actions)
 
     def _packed(self, actions: Any, rows: Sequence[Any]) -> Sequence[Packed | None]:
-        """Each worker's, before others are sent theirs.
-        Raises ``LocalProtocolError``, which names what cannot be sent by its place in ``actions``.
+        """Each worker's encoded step; nothing is sent unless all can be.
+        Raises ``LocalProtocolError``, with the position in all of the ``actions``.
         """
         try:
             pairs = zip(self._each, rows, strict=True)
@@ -344,7 +344,7 @@ class FleetRequests(RequestOrder):
             self._counters.waited(at, perf_counter_ns() - begun_ns)
 
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
-        """The last infos once more, of all parts: theirs do not fit together."""
+        """Fetch the last infos of all parts again, one by one, since they do not fit together."""
         asks = [partial(each.checked_own_infos, deadline) for each in self._each]
         own = self._of_all(asks)
         try:
@@ -372,8 +372,8 @@ class FleetRequests(RequestOrder):
                     self._each[at].make_ready(operation, start)
 
     def _start(self, parts: Sequence[EnvSession]) -> list[Callable[[], None]]:
-        """Start parts side by side, for this thread, which holds their locks; for each what raises
-        why it could not be started.
+        """Start parts side by side while this thread holds their locks; returns functions that
+        raise why a part could not be started.
         """
         self._wait_for_starts()
         parts[0].prewarm.note_use()  # already: the next task starts beside this
@@ -396,7 +396,7 @@ class FleetRequests(RequestOrder):
             raise WorkerTimeoutError("processes are still being started; call reset() again")
 
     def _send(self, sends: Sequence[Callable[[], None]]) -> None:
-        """Send each part its own. Where one fails after others were sent theirs, it is noted."""
+        """Send to each part. A failure after others were sent theirs is kept for ``_of_all``."""
         self._unsent = {}
         for at, send in enumerate(sends):
             try:
@@ -409,10 +409,7 @@ class FleetRequests(RequestOrder):
                 self._each[at].fall_behind()
 
     def _of_all(self, calls: Sequence[Callable[[], T]], first: int = 0) -> list[T]:
-        """What each part gives. Every one is waited for; then the first failure is raised.
-
-        See interruption.md, rule 17.
-        """
+        """Make all calls, then raise the first failure: interruption.md, rule 17."""
         failures, self._unsent = self._unsent, {}
         taken: dict[int, T] = {}
         count = len(calls)

@@ -92,9 +92,9 @@ class InFlight:
     # --- there ---------------------------------------------------------------------------------
 
     def rows(self, env_ids: Any) -> Rows:
-        """Those of these ids; of all for None.
-        Raises ``ActionError``: there is no such sub-environment, one is named twice, or a worker
-        has another one beside these.
+        """The rows with these ids; all for None.
+        Raises ``ActionError``: there is no such sub-environment, one is named twice, or one is
+        missing that shares a worker with these.
         """
         count = len(self._worker_of)
         if env_ids is None:
@@ -132,10 +132,10 @@ class InFlight:
         return workers
 
     def send(self, rows: Rows, actions: Any) -> None:
-        """Send each worker its slice of a validated batch, as its rows were named.
+        """Send each worker its slice of a validated batch, whose order is that of the ids.
 
-        Raises as ``Requests.submit_step`` does, and nothing was sent then. Where a worker fails
-        after others were sent theirs, ``recv`` raises that.
+        Raises as ``Requests.submit_step`` does, if nothing was sent. A later failure is raised by
+        ``recv``.
         """
         if rows.order is not None:
             actions = batches.reordered(self._actions, actions, rows.order)
@@ -186,7 +186,7 @@ class InFlight:
         return use.hold(locks) if isinstance(use, FleetUse) else all_held(locks)
 
     def _refuse_if_interrupted(self, name: str) -> None:
-        """Whom a send has reached, or whose results are lost, is not known then."""
+        """After an interrupt it is not known who was sent something, or whose results are lost."""
         if self._sends or any(queue.interrupted for queue in self._queues):
             restart = self._queues[0].part.repository.policy.restart
             refused = refusal(State.PENDING, name, restart, "send or recv")
@@ -194,7 +194,7 @@ class InFlight:
             raise refused
 
     def _note(self) -> None:
-        """Other requests are refused for as long as something is in flight."""
+        """Refuse other requests as long as something is in flight."""
         self._order.waiting = SENT if self._is_pending() else None
 
     def _is_pending(self) -> bool:
@@ -270,9 +270,8 @@ class InFlight:
         self._ready.append((worker, result))
 
     def _first(self, min_ready: int) -> dict[int, StepResult] | None:
-        """Results by workers, in the order in which they were taken; None while these are too few.
-
-        As many as there are, where no more are to come. Raises the error whose turn it is.
+        """The oldest result of each worker, until there are ``min_ready`` rows or no more to come;
+        None if there will be more. Raises the error whose turn it is.
         """
         self._order.refuse_if_closed()
         oldest: dict[int, StepResult] = {}
@@ -295,7 +294,7 @@ class InFlight:
         return None if owing else taken
 
     def _joined(self, taken: dict[int, StepResult]) -> Received:
-        """One batch, by ids. The results that it is made of are taken away."""
+        """Join results into one batch, by ids, and remove them."""
         places = sorted(taken)
         queues = [self._queues[worker] for worker in places]
         env_ids = np.concatenate([np.arange(*queue.rows) for queue in queues])
@@ -340,7 +339,7 @@ def _queues_of(parts: Sequence[EnvSession]) -> list[WorkerQueue]:
 
 @contextmanager
 def held_in_time(lock: threading.RLock, deadline: Deadline) -> Iterator[None]:
-    """Hold what another thread's ``recv`` may have. Raises ``WorkerTimeoutError``, as ``recv``."""
+    """Hold a lock that another thread's ``recv`` may hold; raises as ``recv`` does."""
     left_s, taken = deadline.left_s(), False
     try:
         taken = lock.acquire(timeout=-1 if left_s is None else min(left_s, threading.TIMEOUT_MAX))
