@@ -8,6 +8,7 @@ which is ``PENDING`` for as long as any owes an answer; what ends the session is
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError
@@ -61,38 +62,29 @@ class ShardQueue(WorkerQueue):
 
     def step(self, actions: Any) -> None:
         """See ``WorkerQueue``."""
-        self._try("step", lambda: self._submit("step", m.Step(self._shard_lane().number, actions)))
+        self._submit("step", m.Step(self._shard_lane().number, actions))
 
     def reset(self, message_for: MessageFor) -> None:
         """See ``WorkerQueue``."""
-        message = message_for(self._shard_lane().number, self.rows)
-        self._try("reset", lambda: self._submit("reset", message))
+        self._submit("reset", message_for(self._shard_lane().number, self.rows))
 
     def _submit(self, operation: str, message: m.Message) -> None:
-        lane = self._shard_lane()
-        assert self._whole is not None
-        self._whole.leave_slots()
-        self._requests.submit_alone(lane, operation, message)
+        lane, whole = self._shard_lane(), self._whole
+        assert whole is not None
+        whole.leave_slots()
+        self._try(operation, partial(self._requests.submit_alone, lane, operation, message))
 
     # --- and back ------------------------------------------------------------------------------
 
-    def _collect_step(self) -> Any:
-        [reply] = self._collect(m.StepDone)
+    def _collect(self) -> tuple[Any, ...]:
+        self.part.lifecycle.request = operation = self._owed[0]
+        lane, is_step = self._shard_lane(), operation == "step"
+        kind: Any = m.StepDone if is_step else m.ResetDone
+        replies = self._requests.collect(self._deadline, kind, lane)
         try:
-            return self._results().step([reply])
+            return lane.declared.step(replies) if is_step else lane.declared.reset(replies)
         except EnvHubError:
             with self._requests.use.judging("recv"):  # on failure only: it costs some us
-                raise
-
-    def _collect(self, kind: type[m.M]) -> list[m.M]:
-        self.part.lifecycle.request = self._owed[0]
-        return self._requests.collect(self._deadline, kind, self._shard_lane())
-
-    def _finish_reset(self, replies: list[m.ResetDone]) -> Any:
-        try:
-            return self._results().reset(replies)
-        except EnvHubError:
-            with self._requests.use.judging("recv"):
                 raise
 
     def _go_on(self) -> None:

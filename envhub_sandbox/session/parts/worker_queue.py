@@ -43,8 +43,8 @@ class WorkerQueue:
         part: Its session.
         rows: The first of its sub-environments, and the one after the last.
         count: How many they are.
-        failure: What the sending of a step that had waited has ended in.
-        taking: Whether an answer is being taken; else an interrupt came into that.
+        failure: The error of sending a step that had waited here.
+        taking: Whether an answer is being taken; True afterwards only after an interrupt.
     """
 
     def __init__(self, part: EnvSession, rows: tuple[int, int], *, sliced: bool) -> None:
@@ -74,7 +74,7 @@ class WorkerQueue:
 
     @property
     def lane(self) -> Lane | None:
-        """The way to it, where something is owed; else ``take`` has nothing to wait for."""
+        """The lane to wait on; None if ``take`` has nothing to wait for."""
         return self.part.lease.lane if self._owed else None
 
     @property
@@ -85,8 +85,8 @@ class WorkerQueue:
     # --- there ---------------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """With the lock held, before ``step``; nothing is sent. Raises as ``Requests.submit`` does.
-        Raises ``AlreadyPendingCallError``: it owes as many answers as it may.
+        """With the lock held, prepare for ``step``; raises as ``Requests.submit`` does.
+        Raises ``AlreadyPendingCallError``: the worker owes as many answers as it may.
         """
         if len(self._owed) + len(self._waiting) >= MAX_IN_FLIGHT:
             raise AlreadyPendingCallError(
@@ -98,8 +98,8 @@ class WorkerQueue:
             self._make_ready("step")
 
     def prepare_reset(self) -> None:
-        """Likewise before ``reset``: what has died or is late is brought back, as ``reset`` does.
-        Raises ``AlreadyPendingCallError``: it owes an answer.
+        """With the lock held, prepare for ``reset``: restart a worker that is dead or late.
+        Raises ``AlreadyPendingCallError``: the worker owes an answer.
         """
         if self.busy:
             raise AlreadyPendingCallError(
@@ -110,7 +110,7 @@ class WorkerQueue:
         self._make_ready("reset")
 
     def _is_ready(self, operation: str) -> bool:
-        """Whether it can be sent at once; a reset first finds out whether the worker lives."""
+        """Whether a request can be sent at once; a reset first looks whether the worker lives."""
         return operation != "reset" and self.part.lifecycle.state is State.READY
 
     def _make_ready(self, operation: str) -> None:
@@ -158,10 +158,10 @@ class WorkerQueue:
     # --- and back ------------------------------------------------------------------------------
 
     def take(self, keep: Callable[[StepResult], None]) -> None:
-        """With the lock held, ``keep`` the oldest request's results; rewards are 0 for a reset.
+        """With the lock held, ``keep`` the oldest request's results; a reset has rewards of 0.
 
         Raises as ``Requests.collect_step`` and ``collect`` do; the error names the
-        sub-environments. Where the worker is not ready afterwards, it owes nothing any more.
+        sub-environments. A worker that is not ready afterwards owes nothing more.
         """
         if not self._owed:
             failure, self.failure = self.failure, None
@@ -191,24 +191,21 @@ class WorkerQueue:
             raise
 
     def _take(self) -> StepResult:
-        if self._owed[0] == "step":
-            *result, infos = self._collect_step()
-            return (*result, self._results().joined(infos))
-        observation, infos = self._finish_reset(self._collect(m.ResetDone))
-        no = np.zeros(self.count, np.bool_)
+        *result, infos = self._collect()
         infos = self._results().joined(infos)
-        return observation, np.zeros(self.count), no, no.copy(), infos
+        if len(result) > 1:
+            return (*result, infos)  # a step's
+        no = np.zeros(self.count, np.bool_)
+        return result[0], np.zeros(self.count), no, no.copy(), infos
 
     def _results(self) -> Results:
         return self._requests.results
 
-    def _collect_step(self) -> StepResult:
-        return self._requests.collect_step(self._deadline)
-
-    def _collect(self, kind: type[m.M]) -> list[m.M]:
-        return self._requests.collect(self._deadline, kind)
-
-    def _finish_reset(self, replies: list[m.ResetDone]) -> tuple[Any, dict[Any, Any]]:
+    def _collect(self) -> tuple[Any, ...]:
+        """The oldest request's results, as ``VectorEnv.step`` or ``reset`` returns them."""
+        if self._owed[0] == "step":
+            return self._requests.collect_step(self._deadline)
+        replies = self._requests.collect(self._deadline, m.ResetDone)
         return self._requests.finish_reset(replies, self._deadline)
 
     def _check(self, result: StepResult) -> None:
@@ -249,7 +246,7 @@ class WorkerQueue:
         self.forget()
 
     def forget(self) -> None:
-        """Expect nothing: the session has ended, or is to be recovered."""
+        """Expect nothing more: the session has ended, or will be recovered."""
         self._owed.clear()
         self._waiting.clear()
         self.failure, self.taking = None, False
