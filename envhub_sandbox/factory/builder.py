@@ -1,9 +1,9 @@
 """Has a jail build a wheel: ``python -I -m envhub_sandbox.factory.builder FOLDER``.
 
-``dependencies`` starts it, since it knows no sandboxes. In the folder lies ``order.json``, and the
-sources; what came of it is printed as one object of JSON: ``wheel``, its name, which lies in
-``wheel/`` then; ``requires``, what the backend needs besides; or ``failed``, what the build said.
-It ends with the process that started it.
+``extras.packages.builds`` starts it, since packages know no sandboxes. The folder has the sources
+and ``order.json``. The result is printed as JSON: ``wheel``, the name of the file in ``wheel/``;
+``requires``, what the backend needs besides; or ``failed``, the build's output. It ends with the
+process that started it.
 """
 
 from __future__ import annotations

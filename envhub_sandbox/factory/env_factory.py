@@ -1,8 +1,8 @@
-"""The environments that a caller gets, of a remembered manifest or out of a first jail.
+"""Makes a caller's environments, from a remembered manifest or from a first jail.
 
 ``ManifestCache`` remembers what a pinned repository's ``make_env`` returned, so that the next call
-starts no process. An entry is the worker's own message, and is read as suspiciously as when it
-came: whatever cannot be read is a miss. The key holds everything that the manifest may depend on.
+starts no process. An entry is the worker's own message, is checked again when it is read, and is
+ignored if that fails. The key holds everything that the manifest may depend on.
 """
 
 from __future__ import annotations
@@ -109,8 +109,7 @@ class ManifestCache:
 def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runtime) -> str | None:
     """The entry's name; None if an argument has no form that can be compared.
 
-    Pickles of equal values may differ (the order of a set of texts does in each process): that is
-    a miss, and no harm.
+    Pickles of equal values may differ, such as sets of texts in each process: then it is a miss.
     """
     try:
         arguments = b"".join(map(bytes, m.pack(load, pickler=partial(pickled, lasting=True))))
@@ -224,9 +223,7 @@ class EnvFactory:
         return retry_while_busy(ask, self._launcher.retry_s, deadline, self._repository.label)
 
     def _open_again(self, played: LoadedJail, deadline: Deadline) -> LoadedJail:
-        """Another jail in the place of one in which sub-environments were played: files that these
-        have written are not there.
-        """
+        """Replace a jail in which sub-environments were played, and may have written files."""
         self._launcher.close(played)
         manifest = played.manifest
         with self._repository.named():
@@ -305,7 +302,7 @@ class EnvFactory:
 
 
 def _each(launcher: Launcher, start: int, stop: int) -> Iterator[tuple[Launcher, tuple[int, int]]]:
-    """A worker in the same place for each sub-environment."""
+    """One worker for each sub-environment, all in the same place."""
     for index in range(start, stop):
         yield launcher if index == start else launcher.another(), (index, index + 1)
 

@@ -209,7 +209,7 @@ def _launchers(repository: Repository, sandbox: Sandbox, options: Options) -> li
 
 @dataclass(frozen=True)
 class _Plan:
-    """What was asked for, looked at before anything is fetched or started."""
+    """What the arguments ask for, checked before anything is fetched or started."""
 
     sandbox: Sandbox
     policy: Policy
@@ -248,9 +248,8 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
 
 
 def _ahead(plan: _Plan, options: Options) -> int | None:
-    """How many tasks are started ahead, unasked none where it is not ours alone to say.
-
-    A container's memory is all its jails', a quota is all a key's, and a GPU everybody's.
+    """How many tasks are started ahead; by default none where that would take what is shared: a
+    container's memory, a key's quota, a GPU.
     """
     prewarm = plan.policy.prewarm
     if prewarm is None and (options.sandbox != "process" or plan.policy.gpu):
@@ -258,7 +257,7 @@ def _ahead(plan: _Plan, options: Options) -> int | None:
     return prewarm
 
 
-# --- what arguments mean
+# --- reading arguments
 
 
 def reference_of(cfg: Any) -> tuple[str, Any]:
@@ -313,9 +312,7 @@ def sandbox_of(sandbox: str | Sandbox | list[str | Sandbox]) -> Sandbox:
 
 
 def _extra(module: str, name: str) -> Any:
-    """What makes a place that is no part of the core, which therefore imports it by its name.
-    Raises ``SandboxUnavailableError``: this installation lacks it.
-    """
+    """A sandbox class of an extra. Raises ``SandboxUnavailableError``: the extra is missing."""
     instead = f"use {option_name('sandbox', 'process')}"
     return extras.required(f"envhub_sandbox.extras.{module}", name, option_name("sandbox"), instead)
 
@@ -337,7 +334,7 @@ def interpreter(python: str | Path | None) -> str:
 
 
 def check_executable(python: str) -> None:
-    """Refuse an interpreter of this machine that cannot be run. Raises ``PolicyError``."""
+    """Raise ``PolicyError`` if an interpreter of this machine cannot be run."""
     if python and not (os.path.isfile(python) and os.access(python, os.X_OK)):
         raise PolicyError(
             f"{option_name('python')} is {python!r}, which is not a program; it takes the path of "
@@ -346,9 +343,7 @@ def check_executable(python: str) -> None:
 
 
 def check_readable(paths: Iterable[str]) -> None:
-    """Refuse to grant what is not on this machine: it would silently not be there.
-    Raises ``PolicyError``: a path leads to nothing.
-    """
+    """Raise ``PolicyError`` if a readable path does not exist on this machine."""
     for path in paths:
         if not os.path.exists(path):
             raise PolicyError(

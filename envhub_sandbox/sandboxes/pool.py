@@ -5,14 +5,14 @@ who closes one environment often opens another. ``ServerHold`` keeps one for a w
 
 Interrupts, finalizers, threads and forks come between any two statements (interruption.md):
 
-- Who uses a server is read off the uses that live. There is no count that a Ctrl-C could falsify
-  (rule 8). A use that was taken and noted nowhere is given back by its own finalizer (rule 5).
-- A use that is given back is not ``live`` first, and ``done`` last. Each step between the two may
-  be repeated without harm, so ``release`` can be called until it comes through (rule 7).
+- The users of a server are its live uses: a Ctrl-C could falsify a count (rule 8). The finalizer of
+  a use that was noted nowhere gives it back (rule 5).
+- Giving a use back clears ``live`` first and sets ``_done`` last. The steps between are repeatable,
+  so ``release`` can be called until it comes through (rule 7).
 - The lock is reentrant: the garbage collector may close an environment in the middle of
   ``acquire``, and a signal handler in the middle of anything (rule 12).
-- A server is started and ended outside of the lock, so that a caller who wants or gives back
-  another does not wait. Who wants the same one waits for its start by a lock of its own.
+- Servers are started and ended outside of the lock, so that callers with other servers do not wait.
+  Each server has a lock for its start, for callers who want the same one.
 - A fork sees its parent's servers under another pid, and leaves them alone.
 """
 
@@ -198,7 +198,7 @@ class ServerPool(Generic[S]):
         entry.server.stop()
         return True
 
-    # --- the idle ones; the lock is held -------------------------------------------------------
+    # --- idle servers; the lock is held ----------------------------------------------------------
 
     def _keep(self, entry: _Entry[S], until: float | None) -> None:
         for other in self._mine():
@@ -235,7 +235,7 @@ class ServerPool(Generic[S]):
             # interruption.md, rule 4: one that a Ctrl-C kept from starting is not joined
             self._thread = thread
 
-    # --- their ends ----------------------------------------------------------------------------
+    # --- ending servers --------------------------------------------------------------------------
 
     def _run(self) -> None:
         while (server := self._due()) is not None:

@@ -1,14 +1,12 @@
 """``sandbox="process"``: the worker server as a child process on this machine, and its folder.
 
-One server serves all environments of this process: it keeps a warm zygote. It is a fresh
-interpreter with a built environment and named descriptors, and it ends when this process does,
-whatever ended it: it holds a pidfd of us. ``LocalServer`` is any server that is our child, also
-in a container.
+One server serves all environments of this process, with a warm zygote. It is a fresh interpreter
+with its own environment variables and descriptors, and ends when this process does, of which it
+holds a pidfd. ``LocalServer`` is any server that is our child, also in a container.
 
-Each has a private folder with its sockets; a socket's path has 107 bytes at most. Its client holds
-the lock of a file in it for as long as it lives, so that others can tell later that it has gone: it
-may be killed at any moment, also before there is a server that would clean up. Containers name
-such a folder.
+Each has a private folder with its sockets, whose paths have at most 107 bytes. Its client locks a
+file in it for as long as it lives, so that others can remove the folder of a client that was
+killed. Containers name such a folder.
 """
 
 from __future__ import annotations

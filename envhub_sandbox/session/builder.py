@@ -1,8 +1,8 @@
 """Where an environment gets its jail from, and how it is built there.
 
-``JailSource``: a suite whose environments are built lazily has a jail per task in use, so that
-closing one frees its processes. ``SharedJail``: where ``make_env`` has already built all of them,
-they live in one. ``Builder`` builds a slice in each runner, and opens the lane to them.
+``JailSource`` gives each task that is in use a jail, so that closing it frees its processes. Where
+``make_env`` has built all environments at once, they live in one ``SharedJail``. ``Builder`` builds
+a slice in each runner, and opens the lane to them.
 """
 
 from __future__ import annotations

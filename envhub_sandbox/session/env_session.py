@@ -1,9 +1,9 @@
 """One task's environment: its life, from the first jail to the last.
 
-It has a ``Lease``, its hold on a jail and the lane there; a ``UseLock``: one thread uses it at
-a time; a ``Prewarm``, which starts it; ``Requests``, which ``vector_env`` uses; and, with
-``restart="transparent"``, a ``Recovery``. None of these knows it. Here it is recovered before a
-reset, closed, and abandoned in a fork. The rules for these are in docs/internals/interruption.md.
+A session has a ``Lease`` (its jail, and the lane there), a ``UseLock`` (one thread at a time), a
+``Prewarm`` (its start), ``Requests`` (for ``vector_env``) and, with ``restart="transparent"``, a
+``Recovery``. None of these knows the session, which recovers before a reset, closes, and is
+abandoned in a fork, by the rules of docs/internals/interruption.md.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class EnvSession:
                 self.lease.take_apart(deadline)
             return self.lease.results.apart
 
-    # --- brought back --------------------------------------------------------------------------
+    # --- recovery --------------------------------------------------------------------------------
 
     def recover(self, grace: Deadline | None = None) -> None:
         """Before a reset, catch up with a late reply, or give up the jail that owes it.
@@ -218,7 +218,7 @@ class EnvSession:
         self.lifecycle.request = None
         self.lifecycle.moved(Event.FORGET)
 
-    # --- the end -------------------------------------------------------------------------------
+    # --- close -----------------------------------------------------------------------------------
 
     def close(self) -> None:
         """Close the environment and end its processes, in bounded time, from any thread.

@@ -1,12 +1,12 @@
 """What is added to the text of an error: the author's own line, advice, and what was denied.
 
-A worker names the files of its repository relative to it. Here they get the name that their author
-knows: the path in the local folder, or the name in the repository at that commit; never the copy
-in the store. The verified snapshot decides which names these are, and not the worker.
+A worker names files relative to its repository. Here they get the names that their author knows:
+the path in the local folder, or the file at that commit, but never the copy in the store. The
+verified snapshot decides about these names, not the worker.
 
-A sentence is added to the errors of downloads, sockets and windows: a jail has no network and no
-display, and what libraries say then ("check your Internet connection") is of no help. Which
-sentence, is read off the text. Trust: text from the worker, which chooses among ours and no more.
+Errors of downloads, sockets and windows get advice: a jail has no network and no display, and what
+libraries say then ("check your Internet connection") does not help. Trust: the worker's text only
+selects one of our sentences.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _source(frame: re.Match[str]) -> list[str]:
     return [line for line in (shown, caret if aligned and not frame["function"] else "") if line]
 
 
-# --- what it wanted to reach, and which option brings that ---------------------------------------
+# --- advice on downloads, sockets and windows ----------------------------------------------------
 
 _HUB = (
     r"LocalEntryNotFoundError|OfflineModeIsEnabled|HF_HUB_OFFLINE|huggingface\.co|"
@@ -189,7 +189,7 @@ def _of_display(text: str, policy: Policy) -> str:
     )
 
 
-# --- what its folder has, and it does not see -----------------------------------------------------
+# --- files of a local folder that its code does not see ------------------------------------------
 
 _QUOTED = r"'([^'\n]{1,1024})'|\"([^\"\n]{1,1024})\"|([^\s'\"]{0,512}[./][^\s'\"]{1,512})"
 _NO_MODULE = r"No module named '([\w.]{1,200})'"
@@ -240,7 +240,7 @@ def _names(text: str, folder: str) -> Iterator[str]:
             yield from ("/".join(steps[first:]) for first in range(min(len(steps), _DEEPEST)))
 
 
-# --- what it was denied --------------------------------------------------------------------------
+# --- denials -------------------------------------------------------------------------------------
 
 _DENIAL = r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40}| /.{0,400})?"
 _MOST_DENIALS = 128

@@ -1,7 +1,7 @@
 """Failures of requests: the error for the caller, the crash bundle, the lifecycle's move.
 
-``refusal`` says why an environment takes no request now, and ``Restarts`` how often, and how soon,
-one whose worker died gets a fresh one.
+``refusal`` is the error of a request that the state does not permit; ``Restarts`` bounds how often
+and how soon a dead worker is replaced.
 """
 
 from __future__ import annotations

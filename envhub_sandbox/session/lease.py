@@ -1,7 +1,7 @@
 """An environment's hold on a jail: taken, built in, given up for another, and given back.
 
-It does not know the requests to the environment, nor why a jail is given up. ``AttributeCache`` has
-attributes that are read after each step: from the second time on the runners there watch them.
+It does not know the requests to the environment, nor why a jail is given up. ``AttributeCache``
+answers reads of attributes after each step, which the runners watch from the second read on.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ class Lease:
         if loaded is not None:
             loaded.jail.watched.forget()
 
-    # --- moving in -----------------------------------------------------------------------------
+    # --- taking a jail ---------------------------------------------------------------------------
 
     def acquire(self, deadline: StartupDeadline) -> None:
         """Take a jail, and build the environment in it; ``interrupt`` brings the deadline forward.
@@ -257,7 +257,7 @@ class Lease:
         if self.lifecycle.closed:  # only now: a close from here on sees the jail
             raise closed_during("make_env")
 
-    # --- moving out ----------------------------------------------------------------------------
+    # --- giving it back --------------------------------------------------------------------------
 
     def end(self) -> None:
         """End the jail, whatever it is doing. It is still to be given back."""

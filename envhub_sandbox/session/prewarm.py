@@ -1,9 +1,8 @@
 """The start of an environment's processes: for its first request, or ahead of that.
 
-An evaluation plays task after task. The next task takes time before its first ``reset`` returns: a
-process, imports, the construction of its simulators. That can be done in the background while one
-plays. Results do not depend on it: what fails, or dies, before its first request is started again
-by that request.
+An evaluation plays task after task, and each takes time before its first ``reset`` returns: for
+processes, imports and simulators. The next task can start in the background meanwhile. Results do
+not depend on that: a start ahead that fails is repeated by the first request.
 """
 
 from __future__ import annotations
@@ -88,7 +87,7 @@ class Prewarm:
             self._recovery.started()
         self.lifecycle.on(Event.START)
 
-    # --- ahead of it ---------------------------------------------------------------------------
+    # --- ahead of requests -----------------------------------------------------------------------
 
     def start_in_background(self) -> None:
         """Start its processes in a thread of their own, unless they are there."""

@@ -58,7 +58,7 @@ class Recovery:
         self._asked: Sequence[m.Message] = ()
         self.fresh: tuple[int, ...] = ()
 
-    # --- what is asked -------------------------------------------------------------------------
+    # --- requests --------------------------------------------------------------------------------
 
     def started(self) -> None:
         """Forget attributes that were set: the jail is a fresh one."""

@@ -563,7 +563,7 @@ class Requests(RequestOrder):
             self.results.own_pairs(replies)
             return replies
 
-    # --- out and back --------------------------------------------------------------------------
+    # --- states around sending and receiving -----------------------------------------------------
 
     @contextmanager
     def _sending(self, operation: str) -> Iterator[None]:

@@ -142,7 +142,7 @@ class StartupDeadline(Deadline):
         return _LOOK_AGAIN_MS if left is None else min(left, _LOOK_AGAIN_MS)
 
 
-# --- awake ----------------------------------------------------------------------------------------
+# --- waiting awake -------------------------------------------------------------------------------
 
 _TRIAL = 16
 """Steps of one trial."""

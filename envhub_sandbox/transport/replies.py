@@ -62,7 +62,7 @@ class RunnersDiedError(WorkerDiedError):
         self.jail_gone = jail_gone
 
 
-# --- what was asked for ------------------------------------------------------------------------
+# --- expected replies ----------------------------------------------------------------------------
 
 
 def expect_reply(reply: m.Message, kind: type[m.M]) -> m.M:
@@ -98,7 +98,7 @@ def typed_reply(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.
     )
 
 
-# --- what a server says ---------------------------------------------------------------------
+# --- messages of servers -------------------------------------------------------------------------
 
 
 def _named(fix: str) -> str:
@@ -169,7 +169,7 @@ def death(reply: m.Death) -> WorkerDiedError:
     )
 
 
-# --- what a runner says ---------------------------------------------------------------------
+# --- messages of runners -------------------------------------------------------------------------
 
 _LOADING = {
     "import": "the entry file could not be imported",

@@ -150,7 +150,7 @@ class ActionReader:
         return batch_of(self._space, actions, self._count)
 
 
-# --- what a reset is given ------------------------------------------------------------------------
+# --- seeds and masks of resets -------------------------------------------------------------------
 
 
 def seeds_for_all(seed: Any, manifest: EnvManifest) -> Any:
@@ -208,7 +208,7 @@ def reset_message(manifest: EnvManifest, seeds: Any, options: Any, mask: Any = N
     return message
 
 
-# --- inside ---------------------------------------------------------------------------------------
+# --- helpers -------------------------------------------------------------------------------------
 
 
 def _shape(space: gym.Space[Any], count: int | None) -> tuple[int, ...]:

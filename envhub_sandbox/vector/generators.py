@@ -4,8 +4,8 @@ In one process the environment and its wrappers draw from one generator. Here th
 generator with the state of the one in the jail, and both follow each other:
 
 - Before a request, the jail gets the state of each generator that the caller has drawn from.
-- After it, the caller's is out of date. It is brought up to date when ``np_random`` is read again,
-  or at once if the caller has kept it: then nobody sees when it is used next.
+- After it, the caller's generator is out of date, until ``np_random`` is read again. One that the
+  caller has kept is updated at once, since its next use cannot be seen.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """HTML for notebooks: tables of environments, in which all that comes from a worker is escaped.
 
-No request is sent: a picture is of the frame that the caller has rendered last. Names of suites and
-tasks and the spaces come from the manifest, and so from the worker: they are bounded here, and are
-text, never markup; a frame is numbers, which are encoded here.
+No request is sent: a picture shows the frame that the caller rendered last. Names and spaces come
+from the worker: they are bounded, and escaped as text. Frames are numbers, encoded here.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         self._index = index
         self._depth = depth
 
-    # --- what every environment has ------------------------------------------------------------
+    # --- the interface of gymnasium.Env ----------------------------------------------------------
 
     @short_traceback
     def reset(self, *args: Any, **kwargs: Any) -> Any:
@@ -150,7 +150,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         """Whether the vector environment shows this one's spaces and metadata as its own."""
         return self._vector._manifest.shardable and not self._index and self._depth == _OUTERMOST
 
-    # --- what this one has ---------------------------------------------------------------------
+    # --- its own attributes ----------------------------------------------------------------------
 
     @short_traceback
     def has_wrapper_attr(self, name: str) -> bool:
@@ -200,7 +200,7 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     __str__ = __repr__
 
-    # --- inside --------------------------------------------------------------------------------
+    # --- requests --------------------------------------------------------------------------------
 
     def _identity(self) -> tuple[int, int, int | None]:
         return id(self._vector), self._index, self._depth

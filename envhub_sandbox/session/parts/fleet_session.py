@@ -356,7 +356,7 @@ class FleetRequests(RequestOrder):
         fresh = [bounds for requests, bounds in pairs if requests.came_back]
         return mark_revived(infos, self.results.count, fresh) if fresh else infos
 
-    # --- to all parts, and of all --------------------------------------------------------------
+    # --- all parts together ----------------------------------------------------------------------
 
     def _make_ready(self, operation: str) -> None:
         states = [requests.lifecycle.state for requests in self._each]

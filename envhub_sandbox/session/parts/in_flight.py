@@ -1,8 +1,8 @@
 """What was sent to the workers of an environment, and not received: ``send`` and ``recv``.
 
-The sub-environments of a worker are stepped together, so they are ready together. A worker's
-answers are taken in the order of its requests: what a sub-environment gives depends on its own
-actions and seeds alone. Time decides only in which batch its results come.
+A worker steps its sub-environments together, so they are ready together. Its answers are taken in
+the order of its requests, so results depend on actions and seeds alone; time decides only in which
+batch they come.
 
 Followed: EnvPool's ``send`` and ``recv``, and PufferLib's, for the ids beside the results.
 """
@@ -89,7 +89,7 @@ class InFlight:
         self._ready: deque[tuple[int, StepResult | Exception]] = deque()
         self._sends = False
 
-    # --- there ---------------------------------------------------------------------------------
+    # --- sending ---------------------------------------------------------------------------------
 
     def rows(self, env_ids: Any) -> Rows:
         """The rows with these ids; all for None.
@@ -115,20 +115,17 @@ class InFlight:
         return Rows(named, self._workers_of(ordered), order)
 
     def _workers_of(self, ordered: list[int]) -> list[int]:
-        workers: list[int] = []
-        at = 0
-        while at < len(ordered):
-            workers.append(self._worker_of[ordered[at]])
-            start, stop = self._queues[workers[-1]].rows
-            indices = ordered[at : at + stop - start]
-            if indices != list(range(start, stop)):
-                missing = min(set(range(start, stop)) - set(indices))
+        workers = [*dict.fromkeys(self._worker_of[index] for index in ordered)]
+        if sum(self._queues[worker].count for worker in workers) == len(ordered):
+            return workers
+        for worker in workers:
+            start, stop = self._queues[worker].rows
+            for missing in sorted({*range(start, stop)} - {*ordered}):
                 raise ActionError(
                     f"sub-environments {start} to {stop - 1} are stepped together, by one worker, "
                     f"and env_ids lacks {missing}: name all of them, or give each a worker of its "
                     "own, with num_workers"
                 )
-            at += stop - start
         return workers
 
     def send(self, rows: Rows, actions: Any) -> None:
@@ -200,7 +197,7 @@ class InFlight:
     def _is_pending(self) -> bool:
         return bool(self._ready) or self._sends or any(queue.busy for queue in self._queues)
 
-    # --- and back ------------------------------------------------------------------------------
+    # --- receiving -------------------------------------------------------------------------------
 
     def recv(self, min_ready: int, timeout: float | Deadline | None) -> Received:
         """The results of the first sub-environments that are ready, of each at most one.

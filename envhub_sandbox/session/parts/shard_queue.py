@@ -1,8 +1,8 @@
 """``send`` and ``recv`` where several workers live in one jail: the queue of each of them.
 
-Each is asked by messages of its own, whatever lane the steps of all take: an answer is known by its
-request's number, so it is never taken for another's. The session has one state for all of them,
-which is ``PENDING`` for as long as any owes an answer; what ends the session is lost for all.
+Each worker gets messages of its own, whatever lane steps of all workers take; a request's number
+tells its answer from others. The session has one state for all workers, ``PENDING`` as long as any
+owes an answer; if it ends, it ends for all.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class ShardQueue(WorkerQueue):
             self._whole, self._way = whole, whole.of_shard(self._shard)
         return self._way
 
-    # --- there ---------------------------------------------------------------------------------
+    # --- sending ---------------------------------------------------------------------------------
 
     def _is_ready(self, operation: str) -> bool:
         """Also while other shards of the jail have not answered."""
@@ -74,7 +74,7 @@ class ShardQueue(WorkerQueue):
         whole.leave_slots()
         self._try(operation, partial(self._requests.submit_alone, lane, operation, message))
 
-    # --- and back ------------------------------------------------------------------------------
+    # --- receiving -------------------------------------------------------------------------------
 
     def _collect(self) -> tuple[Any, ...]:
         self.part.lifecycle.request = operation = self._owed[0]

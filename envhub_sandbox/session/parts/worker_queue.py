@@ -82,7 +82,7 @@ class WorkerQueue:
         """Seconds that its oldest request may still take; None for any number."""
         return self._deadline.left_s()
 
-    # --- there ---------------------------------------------------------------------------------
+    # --- sending ---------------------------------------------------------------------------------
 
     def prepare(self) -> None:
         """With the lock held, prepare for ``step``; raises as ``Requests.submit`` does.
@@ -155,7 +155,7 @@ class WorkerQueue:
         is_step = self._owed[0] == "step"
         self._deadline = Deadline(self._timeouts.step_s if is_step else self._timeouts.reset_s)
 
-    # --- and back ------------------------------------------------------------------------------
+    # --- receiving -------------------------------------------------------------------------------
 
     def take(self, keep: Callable[[StepResult], None]) -> None:
         """With the lock held, ``keep`` the oldest request's results; a reset has rewards of 0.
