@@ -103,7 +103,6 @@ def _repository(folder: Path, order: Mapping[str, Any]) -> Repository:
         *(snapshot, m.Load(1, False, None, {}), policy, timeouts, runtime, True),
         recipe=Recipe(make_env=_built, reference=snapshot.reference, config=None),
         installed=None,
-        advice=lambda text: "",
     )
 
 

@@ -247,7 +247,7 @@ class EnvFactory:
             SuitePrewarm(list(suites.values()), self._prewarm)
         return EnvSuites(
             envs,
-            lambda: repository.provenance(manifest),
+            partial(repository.provenance, manifest),
             partial(_close_all, {} if shared is None else shared),
             repository.recipe,
         )

@@ -193,7 +193,7 @@ def _suites(snapshot: Snapshot, config: Any, plan: _Plan, options: Options) -> E
         _launchers(repository, plan.sandbox, options),
         options.num_workers,
         _ahead(plan, options),
-        lambda manifest: plan.source.check(manifest, snapshot.label, load.env_kwargs, config),
+        partial(plan.source.check, label=snapshot.label, env_kwargs=load.env_kwargs, config=config),
     ).make()
 
 
@@ -244,7 +244,7 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     snapshot = snapshot_named(reference, **options.source)
     further = dict(options.env_kwargs or {})
     envs = inprocess.make(snapshot, options.n_envs, options.use_async_envs, config, further)
-    return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
+    return EnvSuites(envs, partial(provenance_of, snapshot, None, []))
 
 
 def _ahead(plan: _Plan, options: Options) -> int | None:

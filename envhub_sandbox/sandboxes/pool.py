@@ -25,6 +25,8 @@ import threading
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from functools import partial
+from operator import itemgetter
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -225,7 +227,7 @@ class ServerPool(Generic[S]):
 
     def _earliest(self) -> tuple[float, _Entry[S]] | None:
         timed = [(entry.until, entry) for entry in self._mine() if entry.until is not None]
-        return min(timed, key=lambda timer: timer[0], default=None)
+        return min(timed, key=itemgetter(0), default=None)
 
     def _watch(self) -> None:
         self._changed.notify_all()
@@ -261,19 +263,18 @@ class ServerPool(Generic[S]):
 
     def stop_idle(self) -> None:
         """End idle servers now, and wait for those that are ending."""
-        self._stop(self._mine)
+        self._stop(used=False)
 
     def stop_all(self) -> None:
         """End all servers of this process, and keep none from now on: at its exit."""
         self._ends = True
-        process_id = os.getpid()
-        self._stop(
-            lambda: [*self._mine(), *(e for e in self._used.values() if e.pid == process_id)]
-        )
+        self._stop(used=True)
 
-    def _stop(self, which: Callable[[], list[_Entry[S]]]) -> None:
+    def _stop(self, *, used: bool) -> None:
         with self._changed:
-            entries, thread = which(), self._thread
+            entries, thread = self._mine(), self._thread
+            if used:
+                entries += [e for e in self._used.values() if e.pid == os.getpid()]
             for entry in entries:
                 for use in entry.uses():
                     use.live, use._done = False, True
@@ -329,7 +330,7 @@ class ServerHold:
         with self._lock:
             self._on_enter()
             self._open.add(ticket)
-        return lambda: self._leave(ticket)
+        return partial(self._leave, ticket)
 
     def keep(self, used: WorkerServer) -> None:
         """Keep the server in which a jail is opened, while environments may need it again."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -178,28 +178,27 @@ class Lease:
         ``WorkerError``: the jail did not come up, died, took too long, or was given up.
         """
         self.give_back()  # of an attempt that was interrupted when all was built
-        self._start(deadline, lambda: self._move_in(partial(self._take, deadline), deadline))
+        with self._starting(deadline):
+            self._move_in(self._take(deadline), deadline)
 
     def adopt(self, loaded: LoadedJail, deadline: Deadline) -> None:
         """Use a jail that is already loaded, instead of taking one."""
         with self.repository.starting(deadline):
-            self._move_in(lambda: loaded, deadline)
+            self._move_in(loaded, deadline)
 
     def replace(self, deadline: StartupDeadline) -> None:
         """Give the jail up, and take another in the same server; raises as ``acquire`` does."""
-
-        def move() -> None:
+        with self._starting(deadline):
             self.leave()
-            self._move_in(partial(self._take, deadline), deadline)
-
-        self._start(deadline, move)
+            self._move_in(self._take(deadline), deadline)
 
     def rebuild(self, dead: list[int], deadline: StartupDeadline) -> None:
         """Build some shards again, in fresh runners of this jail; raises as ``acquire`` does."""
         loaded, lane = self.loaded, self.lane
         assert loaded is not None
         assert lane is not None
-        self._start(deadline, lambda: self._builder.rebuild(loaded, lane, dead, deadline))
+        with self._starting(deadline):
+            self._builder.rebuild(loaded, lane, dead, deadline)
 
     def take_apart(self, deadline: Deadline) -> None:
         """See ``Results.apart``: from now on, in the jail that there is and in each later one."""
@@ -207,11 +206,12 @@ class Lease:
         if self.lane is not None:
             self._builder.take_apart(self.lane, range(len(self.results.bounds)), deadline)
 
-    def _start(self, deadline: StartupDeadline, start: Callable[[], None]) -> None:
+    @contextlib.contextmanager
+    def _starting(self, deadline: StartupDeadline) -> Iterator[None]:
         self._startup = deadline
         try:
             with self.repository.starting(deadline):
-                start()
+                yield
         finally:
             self._startup = None
             self._let_server_go()
@@ -240,9 +240,8 @@ class Lease:
         lost = self._was_loaded and is_unanswered(error)
         return max(retry_s, _SUCCESSOR_S) if lost or is_draining(error) else retry_s
 
-    def _move_in(self, take: Callable[[], LoadedJail], deadline: Deadline) -> None:
+    def _move_in(self, loaded: LoadedJail, deadline: Deadline) -> None:
         """Build the environment in a jail; a Ctrl-C leaves none behind: interruption.md, rule 4."""
-        loaded = take()
         try:
             lane = self._builder.build(loaded, deadline)
             self.loaded, self.lane = loaded, lane

@@ -180,6 +180,10 @@ def _differences(value: Any) -> Any:
     }
 
 
+def _no_advice(subject: object) -> str:
+    return ""
+
+
 class Repository:
     """What the environments of one ``make_env`` have in common. Opens nothing: see ``Launcher``.
 
@@ -213,8 +217,8 @@ class Repository:
         min_ready: int | None = None,
         recipe: Recipe,
         installed: dict[str, Any] | None,
-        advice: Callable[[str], str],
-        of_its_day: Callable[[EnvHubError], str] = lambda error: "",
+        advice: Callable[[str], str] = _no_advice,
+        of_its_day: Callable[[EnvHubError], str] = _no_advice,
     ) -> None:
         self.snapshot = snapshot
         self.arguments = arguments
