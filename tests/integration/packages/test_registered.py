@@ -77,7 +77,10 @@ def packages(real_index: Index) -> Index:
             ),
         },
     )
-    make_wheel(folder, "no-envs", files={"no_envs.py": ""})
+    asked = "from gymnasium import register\n" + function.replace("_all", "_envs")
+    asked = asked.replace("plugin", "asked")
+    make_wheel(folder, "asked", files={"asked/__init__.py": asked, "asked/envs.py": MAZE})
+    make_wheel(folder, "no-envs", files={"no_envs.py": "from gymnasium import register"})
     return real_index
 
 
@@ -128,10 +131,12 @@ def test_it_gives_pictures_unasked(packages: Index) -> None:
 
 
 @pytest.mark.parametrize(
-    "begins", ["inner-registers#", "plugged-in#", "inner-registers#inner.envs:"]
+    "begins", ["inner-registers#", "plugged-in#", "asked#", "inner-registers#inner.envs:"]
 )
 def test_what_registers_it_is_found(packages: Index, begins: str) -> None:
-    """A module further inside, also by its name; and a function of the entry point for that."""
+    """A module further inside, also by its name; and a function of the entry point for that, or
+    one that users call.
+    """
     with make_env(f"pypi:{begins}Walled/Maze-v1") as suites:
         suites.env.reset(seed=0)
 
