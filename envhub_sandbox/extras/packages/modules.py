@@ -270,7 +270,7 @@ class MissingModule:
         path = _path_here(module.partition(".")[0], sys.path) if module else ""
         if path and not names:  # an index may have another one of that name
             return self._local(module.partition(".")[0], path)
-        if "." in module and not names:
+        if "." in module and (not names or module.partition(".")[0] in _WORKERS):
             return f"A package of another version has {module}"
         name = next(iter(names), "NAME-OF-THE-PACKAGE")
         extra = option_name("dependencies", {"extra": [name]})

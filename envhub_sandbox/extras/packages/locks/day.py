@@ -54,7 +54,8 @@ def of_its_day(snapshot: Snapshot, error: EnvHubError) -> str:
     said, days = _said_at_start(error), days_for(snapshot, error)
     for pattern, (requirement, broken) in _BROKEN_BY.items():
         if re.search(pattern, said) and (not days or days[0] >= broken):
-            older = option_name("dependencies", {"override": [requirement]})
+            # not "override": the others are then chosen to fit an earlier one
+            older = option_name("dependencies", {"extra": [requirement]})
             return f"A later release of a package has broken it; {older} takes an earlier one"
     if not days:
         return ""
