@@ -5,7 +5,7 @@ import runpy
 import sys
 from pathlib import Path
 
-NAMES = ("steps", "auto", "suites", "memory", "remote", "reach", "venvs")
+NAMES = ("steps", "auto", "growth", "suites", "memory", "remote", "reach", "venvs")
 
 
 def sentence(name: str) -> str:

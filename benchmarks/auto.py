@@ -63,8 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _row(workload: Workload, count: int, rounds: int, seconds: float) -> str:
-    given = {"use_async_envs": True, "env_kwargs": workload.arguments}
-    uses = settle(workload, count, seconds, **given)
+    uses = settle(workload, count, seconds, use_async_envs=True)
     fixed = [1]
     while 2 * fixed[-1] <= min(count, len(os.sched_getaffinity(0))):
         fixed.append(2 * fixed[-1])
@@ -111,10 +110,7 @@ def _slice(env: Any, actions: Iterator[Any], seconds: float) -> float:
 
 
 def _made(workload: Workload, count: int, workers: int | None) -> Any:
-    arguments = workload.arguments
-    return make_env(
-        str(workload.folder), count, use_async_envs=True, num_workers=workers, env_kwargs=arguments
-    )
+    return make_env(str(workload.folder), count, use_async_envs=True, num_workers=workers)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -68,6 +68,7 @@ def summary(costs: Sequence[int]) -> dict[str, Any]:
     count = len(ordered)
     return {
         "steps": count,
+        "p10_ns": ordered[count // 10],
         "mean_ns": sum(ordered) / count,
         "p50_ns": ordered[count // 2],
         "p95_ns": ordered[min(count - 1, count * 95 // 100)],

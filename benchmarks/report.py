@@ -31,12 +31,10 @@ def markdown(results: dict[str, Any]) -> Iterator[str]:
     yield f"{results['rounds']} rounds of {results['seconds']} s for each peer."
     yield ""
     yield from _targets(results)
-    for part in ("steps", "growth"):
-        if part in results:
-            yield f"## {part.capitalize()}"
-            yield ""
-        for cell in results.get(part, []):
-            yield from cell_lines(cell)
+    yield "## Steps"
+    yield ""
+    for cell in results["steps"]:
+        yield from cell_lines(cell)
 
 
 def _targets(results: dict[str, Any]) -> Iterator[str]:

@@ -52,15 +52,11 @@ def run(plan: Plan, interpreters: Interpreters) -> dict[str, Any]:
     """Each part of the plan."""
     patience = Patience(plan.patience_s)
     cells = _cells(plan, plan.cells, plan.peers, plan.conditions, patience, interpreters)
-    results: dict[str, Any] = {
+    return {
         "steps": cells,
         "targets": reached(cells),
         "against_others": against_others(cells),
     }
-    if plan.growing:
-        peers = plan.growing_peers()
-        results["growth"] = _cells(plan, plan.growing, peers, ["quiet"], patience, interpreters)
-    return results
 
 
 def _cells(
@@ -91,16 +87,14 @@ def _cells(
 
 
 def _parser() -> argparse.ArgumentParser:
-    compared = [name for name, workload in WORKLOADS.items() if not workload.grows]
     parser = argparse.ArgumentParser(prog="python -m benchmarks steps", description=__doc__)
     add = parser.add_argument
-    add("--growth", action="store_true", help="also the cost by number and size of observations")
     add(
         "--quick",
         action="store_true",
         help="under a minute: does it run, and is the report complete?",
     )
-    add("--workloads", nargs="+", choices=WORKLOADS, default=compared)
+    add("--workloads", nargs="+", choices=WORKLOADS, default=list(WORKLOADS))
     add("--sizes", nargs="+", type=int, help="numbers of sub-environments")
     add("--conditions", nargs="+", choices=CONDITIONS, default=list(CONDITIONS))
     add("--peers", nargs="+", choices=PEERS, default=list(PEERS))

@@ -14,11 +14,7 @@ def problems(results: dict[str, Any], plan: Plan) -> list[str]:
     Peers that are not installed are no problem; ours and Gymnasium's are always there.
     """
     wanted = [name for name in plan.peers if name in (SYNC, ASYNC, "envhub", "envhub-frames")]
-    found = _cells(results["steps"], len(plan.cells) * len(plan.conditions), wanted)
-    return found + _cells(results.get("growth", []), len(plan.growing), plan.growing_peers())
-
-
-def _cells(cells: list[dict[str, Any]], expected: int, wanted: list[str]) -> list[str]:
+    cells, expected = results["steps"], len(plan.cells) * len(plan.conditions)
     found = [] if len(cells) == expected else [f"{len(cells)} cells instead of {expected}"]
     for cell in cells:
         where = f"{cell['workload']}, n = {cell['n']}, {cell['condition']}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 from types import ModuleType
@@ -26,34 +26,17 @@ class Workload:
         title: For tables.
         sizes: Numbers of sub-environments.
         envpool: Its name in EnvPool, if EnvPool has it.
-        repository: Its folder in ``repositories/``, if not its name.
-        arguments: For the repository's functions.
-        grows: Whether it belongs to the series that shows growth, not to the comparison.
     """
 
     name: str
     title: str
     sizes: tuple[int, ...] = (1, 4, 16, 64)
     envpool: str | None = None
-    repository: str = ""
-    arguments: dict[str, Any] = field(default_factory=dict)
-    grows: bool = False
 
     @property
     def folder(self) -> Path:
         """The repository."""
-        return REPOSITORIES / (self.repository or self.name)
-
-
-def _bytes(size: int, title: str) -> Workload:
-    return Workload(
-        f"bytes-{size}",
-        f"{title} observations",
-        sizes=(4,),
-        repository="bytes",
-        arguments={"size": size},
-        grows=True,
-    )
+        return REPOSITORIES / self.name
 
 
 WORKLOADS = {
@@ -65,11 +48,6 @@ WORKLOADS = {
         Workload("cameras", "2 cameras 480x640x3", sizes=(8,)),
         Workload("busy", "2 ms busy step"),
         Workload("sleeping", "2 ms sleeping step"),
-        _bytes(64, "64 B"),
-        _bytes(4 << 10, "4 KiB"),
-        _bytes(64 << 10, "64 KiB"),
-        _bytes(1 << 20, "1 MiB"),
-        _bytes(4 << 20, "4 MiB"),
     )
 }
 
@@ -89,7 +67,7 @@ def module(folder: Path) -> ModuleType:
 def single(name: str) -> Any:
     """One sub-environment of a workload, in this process."""
     workload = WORKLOADS[name]
-    return module(workload.folder).single(**workload.arguments)
+    return module(workload.folder).single()
 
 
 def makers(name: str, count: int) -> list[Callable[[], Any]]:

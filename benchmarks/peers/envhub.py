@@ -23,7 +23,6 @@ def open_peer(workload: Workload, count: int, **arguments: Any) -> Any:
         raise Missing(f"make_env has no {', '.join(unknown)}")
     if arguments.get("num_workers") == -1:
         arguments["num_workers"] = count
-    arguments["env_kwargs"] = workload.arguments
     if arguments.get("use_async_envs") and arguments.get("num_workers") is None:
         settle(workload, count, **arguments)
     env = make_env(str(workload.folder), n_envs=count, **arguments).env

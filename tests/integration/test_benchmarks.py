@@ -4,6 +4,7 @@
 takes longer than what it shows: they are left out.
 """
 
+import re
 import subprocess
 from pathlib import Path
 
@@ -20,6 +21,14 @@ def test_a_benchmark_runs(checkout: Path) -> None:
     assert "| CartPole | 2 |" in benchmark(checkout, "benchmarks", *SHORT.split()).stdout
 
 
+def test_growth_is_measured_and_drawn(checkout: Path, tmp_path: Path) -> None:
+    plot = tmp_path / "growth.svg"
+    words = f"growth --sizes 1 2 --bytes 9 --processes 1 --rounds 1 --seconds 0.01 --plot {plot}"
+    told = benchmark(checkout, "benchmarks", *words.split()).stdout
+    assert re.findall(r"^\| (\d+) \|", told, re.MULTILINE) == ["1", "2", "9", "1"]
+    assert plot.read_text().count("<polyline") == 4 + 4 + 3
+
+
 def test_the_comparison_runs(checkout: Path, tmp_path: Path) -> None:
     benchmark(checkout, "benchmarks", "steps", "--quick", "--out", str(tmp_path))
     assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".md"}
@@ -33,5 +42,5 @@ def test_a_benchmark_that_lacks_its_environment_says_how_to_make_it(checkout: Pa
 def test_the_benchmarks_are_listed_with_a_sentence_each(checkout: Path) -> None:
     _, _, *lines = benchmark(checkout, "benchmarks").stdout.splitlines()
     words = {line.split()[0]: line.split(maxsplit=1)[1] for line in lines}
-    assert {"auto", "remote", "steps", "suites", "reach", "memory"} <= {*words}
+    assert {"auto", "growth", "remote", "steps", "suites", "reach", "memory"} <= {*words}
     assert all(text.endswith(".") for text in words.values())
