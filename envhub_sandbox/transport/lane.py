@@ -1,9 +1,9 @@
 """The way of an environment's requests to its runners: over the server, or a faster one.
 
 There are three: ``Lane``, below; ``ServedLane``, which is the same with faster steps; and
-``SharedMemoryLane``, whose steps and small messages need no server. Which of them an environment
-has is decided once, when it is built (``session/builder``). What a request means does not depend
-on the lane.
+``SharedMemoryLane``, whose steps and small messages need no server. What these two have in common
+is in ``shared_memory/slab_lane``. Which of them an environment has is decided once, when it is
+built (``session/builder``). What a request means does not depend on the lane.
 """
 
 from __future__ import annotations

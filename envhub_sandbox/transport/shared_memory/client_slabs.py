@@ -28,11 +28,10 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import Frames
 from envhub_sandbox.transport.lane import RECHECK_MS
-from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.values import to_tensor, unpacked
 from envhub_worker.protocol import messages as m
@@ -56,6 +55,8 @@ Schema = list[tuple[slabs.Column, Any]]
 """What columns infos have, and where each lies in a slab."""
 Outcome = tuple[int, m.Message | None]
 """``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and what came encoded."""
+NO_MORE: Outcome = (slabs.DONE, None)
+"""Results and nothing else."""
 _OUTCOMES = frozenset({slabs.DONE, slabs.RAISED, slabs.FETCH, slabs.COLUMNS})
 _UNKNOWN = -1
 RING = 4
@@ -247,6 +248,8 @@ class ShardSlabs:
             return kind, None
         start = slabs.INFOS
         message = unpacked([self._reply[start : start + length]])
+        if isinstance(message, m.RaisedException):  # which it may call something else
+            return slabs.RAISED, message
         if isinstance(message, m.Value) and type(message.value) is dict:
             with UNTRUSTED:
                 self._learn(message.value)
@@ -380,24 +383,8 @@ class LaneShard(ShardSlabs):
             self._slab_files.pop().close()
         self._runner_bell.handed_over()
 
-    def ask(self, leaves: Sequence[Any], wishes: Wishes) -> None:
-        """Write a shard's actions and announce them."""
-        self.write(leaves, wishes)
-        self._announce()
-
-    def tell(self, frames: Frames, wishes: Wishes, slots: SlotRing | None = None) -> None:
-        """Write a message and announce it; as ``write_message``."""
-        self.write_message(frames, wishes, slots)
-        self._announce()
-
-    def step_again(self, actions: Any, wishes: Wishes, slots: SlotRing) -> bool:
-        """Write a step and announce it; as ``write_actions``."""
-        written = self.write_actions(actions, wishes, slots)
-        if written:
-            self._announce()
-        return written
-
-    def _announce(self) -> None:
+    def announce(self) -> None:
+        """Have the runner read what was written."""
         self.sequence += 1
         self._asks[slabs.SEQUENCE] = self.sequence
         if self._tells[slabs.PARKED]:
@@ -501,36 +488,25 @@ def infos_of(shard: ShardSlabs, outcome: Outcome, results: Results) -> dict[Any,
     return shard.columns() if kind == slabs.COLUMNS else results.info(message)
 
 
-def by_shard(error: RunnersDiedError, asked: Sequence[int]) -> dict[int, WorkerDiedError]:
-    """The deaths of those that were asked, by their shards."""
-    return {asked[place]: death for place, death in error.deaths.items()}
-
-
 class SlotRing:
     """A slab of slots, of which the next batch goes into one that nobody holds.
 
     Args:
         count, slot_bytes, total_bytes: Their number, the size of each and of the slab.
-        received: Its memory, where that is shared with nobody; there is one slot then.
 
     Attributes:
-        fd: Its descriptor, for the runners; -1 where there is none.
+        fd: Its descriptor, for the runners.
         count, slot_bytes: As given.
         chosen: The slot of the last batch.
     """
 
-    def __init__(
-        self, count: int, slot_bytes: int, total_bytes: int, received: memoryview | None = None
-    ) -> None:
-        self._memory: Any = received
-        self.count, self.slot_bytes = count, slot_bytes
-        self.fd = -1
-        if received is None:
-            # late, for Linux alone has what it imports
-            from envhub_worker.protocol.shared_memory.descriptors import sealed_memfd
+    def __init__(self, count: int, slot_bytes: int, total_bytes: int) -> None:
+        # late, for Linux alone has what it imports
+        from envhub_worker.protocol.shared_memory.descriptors import sealed_memfd
 
-            self._memory, self._file = sealed_memfd("observations", total_bytes)
-            self.fd = self._file.fileno()
+        self.count, self.slot_bytes = count, slot_bytes
+        self._memory, self._file = sealed_memfd("observations", total_bytes)
+        self.fd = self._file.fileno()
         if count == 1:
             self._slots = [self._memory]
         else:
@@ -573,19 +549,13 @@ class ObservationSlab(SlotRing):
     Args:
         space: The single observation space.
         layout: Where everything lies.
-        received: As ``SlotRing`` has it.
 
     Attributes:
         layout: Where everything lies.
     """
 
-    def __init__(
-        self,
-        space: gym.Space[Any],
-        layout: slabs.ObservationLayout,
-        received: memoryview | None = None,
-    ) -> None:
-        super().__init__(layout.slots, layout.slot_bytes, layout.total_bytes, received)
+    def __init__(self, space: gym.Space[Any], layout: slabs.ObservationLayout) -> None:
+        super().__init__(layout.slots, layout.slot_bytes, layout.total_bytes)
         self.layout = layout
         self._assemble = slabs.assembler(space)
         self._copies = [_copier(self._slots[_SPARE], leaf) for leaf in layout.leaves]

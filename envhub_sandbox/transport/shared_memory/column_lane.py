@@ -12,33 +12,33 @@ from typing import Any
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.lane import Lane
-from envhub_sandbox.transport.replies import RunnersDiedError
-from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.client_slabs import (
-    JoinedColumns,
+    NO_MORE,
+    LaneShard,
     ObservationSlab,
     Outcome,
     SlotRing,
     action_layouts,
-    infos_of,
 )
-from envhub_sandbox.transport.shared_memory.lane import STEP, SharedMemoryLane
+from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
+from envhub_sandbox.transport.shared_memory.slab_lane import STEP, ColumnSteps
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.shared_memory import slabs
-from envhub_worker.protocol.spaces import batches
 
 _NOTHING: list[Outcome] = []
-_NO_MORE: Outcome = (slabs.DONE, None)
+_ANY_CPU = [0]
 
 
-class ColumnLane(SharedMemoryLane):
-    """See ``SharedMemoryLane``.
+class ColumnLane(ColumnSteps, SharedMemoryLane):
+    """See ``ColumnSteps`` and ``SharedMemoryLane``.
 
     Args:
         observed: Where the observations lie.
     """
+
+    shards: list[LaneShard]
 
     def __init__(
         self,
@@ -47,15 +47,11 @@ class ColumnLane(SharedMemoryLane):
         layouts: Sequence[slabs.Layout],
         attachment: Attachment,
     ) -> None:
-        manifest = relay.declared.manifest
-        self.observations = ObservationSlab(manifest.single_observation_space, observed)
-        super().__init__(relay, layouts, [self.observations] * len(layouts), attachment)
-        self._bounds = relay.declared.slices
-        self._action_space = manifest.single_action_space
-        leaves = layouts[0].actions
-        self._flat_actions = len(leaves) == 1 and not leaves[0].path
-        self._said = _NOTHING
-        self._joined = JoinedColumns((), ())
+        self.observations = ObservationSlab(
+            relay.declared.manifest.single_observation_space, observed
+        )
+        slots = [self.observations] * len(layouts)
+        super().__init__(layouts[0], self.observations, relay, layouts, slots, attachment)
         self._steps = 0
         self._step_bytes = sum(one.action_bytes for one in layouts), observed.batch_bytes
 
@@ -90,73 +86,34 @@ class ColumnLane(SharedMemoryLane):
         """See ``Lane``."""
         self._asked = STEP  # interruption.md, rule 1: first
         self._steps += 1
-        leaves = [actions] if self._flat_actions else slabs.flatten(self._action_space, actions)
+        rows = self._rows(actions)
         self._asked_ns = perf_counter_ns()
         self._spin = self._step_spin
         spin_ns = self._spin.budget_ns
         slot = self.observations.choose()
-        if len(self.shards) == 1:
-            self.shards[0].ask(leaves, (slot, spin_ns, 0))
-            return
+        # one shard alone is left to the kernel
+        cpus = self._cores.of_shards() if len(self.shards) > 1 else _ANY_CPU
         # the first ones start while the last ones are still asked: with many, each moment counts
-        asked = zip(self.shards, self._bounds, self._cores.of_shards(), strict=True)
-        flat = self._flat_actions
-        for index, (shard, (start, stop), cpu) in enumerate(asked):
-            wishes = slot, spin_ns if index < self._awake else 0, cpu
-            rows = [actions[start:stop]] if flat else [leaf[start:stop] for leaf in leaves]
-            shard.ask(rows, wishes)
+        for index, (shard, leaves, cpu) in enumerate(zip(self.shards, rows, cpus, strict=True)):
+            shard.write(leaves, (slot, spin_ns if index < self._awake else 0, cpu))
+            shard.announce()
 
-    def wait(self, deadline: Deadline) -> None:
-        """See ``Lane``."""
+    def _outcomes(self, deadline: Deadline) -> tuple[list[Outcome], dict[int, WorkerDiedError]]:
         deaths = self._wait_for_all(deadline)
-        self._said = self._outcomes(deaths)
-        if self._said:
-            self._take_infos(deaths, deadline)
-        if deaths:
-            raise RunnersDiedError(self._stepped(deaths), deaths)
+        return self._read(deaths), deaths
 
-    def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-        """See ``Lane``. Trust: input from the worker."""
-        if infos is None:
-            infos = self._infos() if self._said else {}
-        return (self.observations.take(), *self.observations.results(), infos)
-
-    def _infos(self) -> dict[Any, Any]:
-        if len(self.shards) > 1 and all(kind == slabs.COLUMNS for kind, _ in self._said):
-            schemas = [shard.schema for shard in self.shards]
-            if not self._joined.is_of(schemas):
-                self._joined = JoinedColumns(schemas, self._bounds)
-            if self._joined.columns:
-                return self._joined.infos()
-        shards = zip(self.shards, self._said, strict=True)
-        parts = [infos_of(shard, outcome, self.declared) for shard, outcome in shards]
-        return self.declared.infos(parts)
-
-    def _outcomes(self, deaths: Collection[int]) -> list[Outcome]:
-        """Every shard's outcome; nothing at all if none says more than its results."""
+    def _read(self, deaths: Collection[int]) -> list[Outcome]:
         for shard in self.shards:
             if deaths or not shard.has_nothing_to_say():
                 return [
-                    _NO_MORE if index in deaths else shard.outcome()
+                    NO_MORE if index in deaths else shard.outcome()
                     for index, shard in enumerate(self.shards)
                 ]
         return _NOTHING
 
-    def _take_infos(self, deaths: dict[int, WorkerDiedError], deadline: Deadline) -> None:
-        """Put the infos in that did not fit.
-
-        What one has raised comes before them, unless a recovery needs them or they were asked for:
-        warnings come with them.
-        """
-        kinds = [kind for kind, _ in self._said]
-        if deaths or self._fetching[0] == self._asked_ns or slabs.RAISED not in kinds:
-            missing = [index for index, kind in enumerate(kinds) if kind == slabs.FETCH]
-            for index, reply in self._fetched(missing, deaths, deadline).items():
-                self._said[index] = slabs.DONE, reply
-
     def _drop(self, deaths: dict[int, WorkerDiedError]) -> None:
         if self._asked == STEP:
-            self._outcomes(deaths)  # it may carry the schema of later columns
+            self._read(deaths)  # it may carry the schema of later columns
         super()._drop(deaths)
 
     def _as_messages(self, answers: list[m.Message | None]) -> list[m.Message | None]:
@@ -170,27 +127,6 @@ class ColumnLane(SharedMemoryLane):
                 else m.ResetDone(part, self.declared.info(reply))
                 for part, reply in zip(self._observations(), answers, strict=True)
             ]
-
-    def _observations(self) -> list[Any]:
-        """The rows of each shard."""
-        space = self.declared.manifest.single_observation_space
-        return list(batches.split(space, self.observations.take(), self._bounds))
-
-    def _stepped(self, deaths: Collection[int]) -> list[m.Message | None]:
-        """What the living wrote, as messages. Trust: input from the worker."""
-        with UNTRUSTED:
-            flags, replies = self.observations.results(), []
-            for index, part in enumerate(self._observations()):
-                replies.append(None if index in deaths else self._step_done(index, part, flags))
-        return replies
-
-    def _step_done(self, index: int, observation: Any, flags: Any) -> m.Message:
-        outcome = self._said[index]
-        if isinstance(outcome[1], m.RaisedException):
-            return outcome[1]
-        rewards, over, cut = (column[slice(*self._bounds[index])] for column in flags)
-        info = infos_of(self.shards[index], outcome, self.declared)
-        return m.StepDone(observation, rewards, over, cut, info)
 
     def traffic(self) -> tuple[int, int, int]:
         """See ``Lane``; of steps in shared memory, infos are left out."""

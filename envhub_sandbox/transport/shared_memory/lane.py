@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from time import perf_counter_ns
 from typing import Any
 
-from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.system.log import MESSAGES
 from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import Cores, Deadline, SpinChooser, own_cpus
@@ -23,15 +23,14 @@ from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.client_slabs import (
     LaneShard,
     SlotRing,
-    by_shard,
     message_layouts,
 )
+from envhub_sandbox.transport.shared_memory.slab_lane import STEP, SlabLane
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 
 # elsewhere a core may see the sequence word before the data it announces: sleep, do not poll
 _ORDERED_STORES = platform.machine() in ("x86_64", "AMD64")
-STEP = "step"
 BY_SERVER = ""
 """In place of an operation's name, where it is the relay that is owed the answer."""
 _BULKY = frozenset({"render"})
@@ -42,7 +41,7 @@ _CAUSE_S = 10.0
 """For how long the server may take to say how a runner has died."""
 
 
-class SharedMemoryLane(Lane):
+class SharedMemoryLane(SlabLane):
     """Slabs and doorbells, over all shards of one environment: see ``Lane``.
 
     Args:
@@ -56,6 +55,7 @@ class SharedMemoryLane(Lane):
     """
 
     name = "shared memory"
+    shards: list[LaneShard]
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class SharedMemoryLane(Lane):
         slots: Sequence[SlotRing],
         attachment: Attachment,
     ) -> None:
-        super().__init__(relay.jail, relay.runners, relay.number, relay.declared)
+        super().__init__(relay)
         self.slots = list(slots)
         pairs = zip(layouts, slots, strict=True)
         self.shards = [LaneShard(layout, ring.fd) for layout, ring in pairs]
@@ -77,8 +77,6 @@ class SharedMemoryLane(Lane):
         may_spin = _ORDERED_STORES and workers < len(own_cpus())
         self._spin = self._step_spin = SpinChooser(may_spin)
         self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
-        self._fetching: tuple[int, Sequence[int]] = 0, ()  # for which request, of which shards
-        self._settled_ns = 0  # the request of which ``answered`` has found all answers
         self._listens = False
         # One core is the client's. Shards that find no other sleep until they are asked, then run
         # on the client's while it sleeps: so it waits for those first, and for the others awake.
@@ -172,17 +170,6 @@ class SharedMemoryLane(Lane):
         """See ``Lane``: there is one slab for what is asked, and one for what is answered."""
         return False
 
-    def _fetch(self, shards: Sequence[int], deadline: Deadline) -> list[m.Message]:
-        """What some shards' runners could not put into their slabs."""
-        if self._fetching != (self._asked_ns, shards):  # else ``answered`` has asked for it
-            self._ask_for(shards)
-        self._fetching = 0, ()
-        return super().replies(deadline)
-
-    def _ask_for(self, shards: Sequence[int]) -> None:
-        packed = [self.jail.pack(m.FetchInfos(self.number))] * len(shards)
-        super().send_some(self._asked, [self.runners[index] for index in shards], packed)
-
     def send_step(self, actions: Any, *, ahead: bool = False) -> None:
         """See ``Lane``."""
         [shard, *others], ring = self.shards, self.slots[0]
@@ -190,7 +177,8 @@ class SharedMemoryLane(Lane):
             self._asked_ns = perf_counter_ns()
             self._spin = self._step_spin
             ring.choose()
-            if shard.step_again(actions, (0, self._spin.budget_ns, 0), ring):
+            if shard.write_actions(actions, (0, self._spin.budget_ns, 0), ring):
+                shard.announce()
                 return
         super().send_step(actions, ahead=ahead)
         if not others and self._asked == STEP:
@@ -215,7 +203,8 @@ class SharedMemoryLane(Lane):
         for index, (shard, frames) in enumerate(zip(self.shards, packed, strict=True)):
             slot, ring = self._slot_for(operation, index)
             spin_ns = self._spin.budget_ns if index < self._awake else 0
-            shard.tell(frames, (slot, spin_ns, cpus[index]), ring)
+            shard.write_message(frames, (slot, spin_ns, cpus[index]), ring)
+            shard.announce()
 
     def _goes_by_slabs(self, operation: str, packed: Sequence[Frames]) -> bool:
         if operation in _BULKY:
@@ -283,48 +272,18 @@ class SharedMemoryLane(Lane):
         """The answers to a message as they would have come through the server; None of the dead."""
         return answers
 
-    def _fetched(
-        self, missing: Sequence[int], deaths: dict[int, WorkerDiedError], deadline: Deadline
-    ) -> dict[int, m.Message | None]:
-        """What did not fit, by shards. Who dies meanwhile is added to the deaths.
+    @property
+    def _by_server(self) -> bool:
+        return self._asked == BY_SERVER
 
-        Trust: input from the worker. An answer that says after ``answered`` that more has to be
-        fetched is refused: that may never come, and others wait meanwhile.
-        """
-        if not missing:
-            return {}
-        if self._settled_ns == self._asked_ns and self._fetching != (self._asked_ns, missing):
-            raise RemoteProtocolError("the worker has changed an answer that was there already")
-        replies: Sequence[m.Message | None]
-        try:
-            replies = self._fetch(missing, deadline)
-        except RunnersDiedError as error:
-            replies = error.replies
-            deaths.update(by_shard(error, missing))
-        return dict(zip(missing, replies, strict=True))
+    def _incomplete(self) -> list[int] | None:
+        if not all(shard.answered() for shard in self.shards):
+            return None
+        self._listen(False)
+        return [i for i, shard in enumerate(self.shards) if shard.has_more_elsewhere()]
 
-    def answered(self) -> bool:
-        """See ``Lane``. What has to be fetched is asked for here: a runner may never give it."""
-        if self._asked == BY_SERVER:
-            return super().answered()
-        if self._settled_ns == self._asked_ns:
-            return True
-        for shard in self.shards:
-            if not shard.answered():
-                return self._listens and self._watch.wait(0)
-        if self._fetching[0] != self._asked_ns:
-            self._listen(False)
-            shards = [i for i, shard in enumerate(self.shards) if shard.has_more_elsewhere()]
-            try:
-                if shards:
-                    self._ask_for(shards)
-            except EnvHubError:  # whoever waits asks again, and meets the same
-                return True
-            self._fetching = self._asked_ns, shards
-        if self._fetching[1] and not super().answered():
-            return False
-        self._settled_ns = self._asked_ns
-        return True
+    def _has_ended(self) -> bool:
+        return self._listens and self._watch.wait(0)
 
     def sources(self) -> list[Source]:
         """See ``Lane``."""
@@ -342,8 +301,6 @@ class SharedMemoryLane(Lane):
     def catch_up(self, deadline: Deadline) -> None:
         """See ``Lane``."""
         super().catch_up(deadline)
-        # with what ``answered`` has asked for besides: it is asked for anew
-        self._settled_ns, self._fetching = 0, (0, ())
         if self._asked != BY_SERVER:
             self._drop(self._wait_for_all(deadline))
 
@@ -402,9 +359,10 @@ class SharedMemoryLane(Lane):
         if not dead:  # they had answered before
             return {}
         try:  # how, the server knows at the latest when they have been reaped
-            self._fetch(dead, Deadline(_CAUSE_S))
+            self._ask_for(dead)
+            Lane.replies(self, Deadline(_CAUSE_S))
         except RunnersDiedError as error:
-            return by_shard(error, dead)
+            return {dead[place]: death for place, death in error.deaths.items()}
         raise RemoteProtocolError("the worker says that a process lives which has died")
 
     # --- the rest ------------------------------------------------------------------------------

@@ -16,51 +16,45 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline, SpinChooser
 from envhub_sandbox.transport.jail import Frames
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import RunnersDiedError, expect_reply, typed_reply
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.shared_memory.client_slabs import (
-    ObservationSlab,
+    NO_MORE,
     Outcome,
     ShardSlabs,
     action_layouts,
-    by_shard,
-    infos_of,
 )
+from envhub_sandbox.transport.shared_memory.slab_lane import STEP, ColumnSteps
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
-from envhub_worker.protocol.limits import LARGE_BYTES
 from envhub_worker.protocol.shared_memory import slabs
 
 _HEAD = struct.Struct("<QQ")
 _HEAD_AT = slabs.OUTCOME * 8
-_PLAIN = _HEAD.pack(slabs.DONE, 0)
-"""Results and nothing else."""
-_NO_MORE: Outcome = (slabs.DONE, None)
-"""The same, read."""
+_PLAIN = slabs.DONE, 0
+_BYTE, _FLAG, _REWARD = map(np.dtype, (np.uint8, np.bool_, np.float64))
 
 
-class ServedLane(Lane):
-    """See ``Lane``.
+class ServedLane(ColumnSteps):
+    """See ``ColumnSteps``.
 
     Args:
         relay: The way over the server, to the same runners.
         shards: The slabs of each.
     """
 
+    shards: list[ServedShard]
+
     def __init__(self, relay: Lane, shards: list[ServedShard]) -> None:
-        super().__init__(relay.jail, relay.runners, relay.number, relay.declared)
-        self._shards = shards
-        self._action_space = self.declared.manifest.single_action_space
-        leaves = shards[0].slabs.layout.actions
-        self._flat_actions = len(leaves) == 1 and not leaves[0].path
+        self.shards = shards
+        batch = ReceivedBatch(relay.declared.manifest.single_observation_space, shards)
+        super().__init__(shards[0].layout, batch, relay)
         self._spin = SpinChooser(True)
         self._by_message = self._more_wanted = self._by_slabs = False
-        self._outcomes: list[Outcome] = []
-        self._asked: Sequence[int] = ()  # shards, for infos that did not fit
 
     @classmethod
     def open(cls, relay: Lane, deadline: Deadline) -> Lane:
@@ -72,7 +66,7 @@ class ServedLane(Lane):
         results = relay.declared
         space = results.manifest.single_observation_space
         shards = [
-            ServedShard(space, layout, observed)
+            ServedShard(layout, observed)
             for layout in action_layouts(results) or ()
             if (observed := slabs.observation_layout(space, layout.count, 1)) is not None
         ]
@@ -85,7 +79,7 @@ class ServedLane(Lane):
         """See ``Lane``; they get slabs that the dead never saw."""
         super().renew(dead, fresh, deadline)
         for index in dead:
-            self._shards[index] = self._shards[index].again()
+            self.shards[index] = ServedShard(self.shards[index].layout, self.shards[index].observed)
         if not self._attach(dead, deadline, again=True):
             raise RemoteProtocolError("a fresh runner refuses the slabs that others take")
 
@@ -93,9 +87,9 @@ class ServedLane(Lane):
         """Have the server make slabs and the runners serve them; whether all of them do.
         ``again``: others have; a refusal of the server's is raised.
         """
-        runners, wanted = self.runners, [(index, self._shards[index]) for index in shards]
+        runners, wanted = self.runners, [(index, self.shards[index]) for index in shards]
         sizes = tuple((runners[index], *shard.sizes) for index, shard in wanted)
-        if not all(slabs.served(*one[1:], self.jail.limits.message_bytes) for one in sizes):
+        if not all(slabs.served(*size[1:], self.jail.limits.message_bytes) for size in sizes):
             return False
         request = m.ShareSlabs(self.jail.number, sizes)
         reply, _ = self.jail.client.request(request, deadline=deadline)
@@ -103,9 +97,10 @@ class ServedLane(Lane):
             return False
         expect_reply(reply, m.Done)
         parts = tuple((runner, 1) for runner in runners)
-        self._step = m.Relay(self.jail.number, "step", parts, False, True)
+        self._step = m.Relay(self.jail.number, STEP, parts, False, True)
         messages: list[tuple[int, m.Message]] = [
-            (runners[index], m.Attach(self.number, 0, shard.count, 1)) for index, shard in wanted
+            (runners[index], m.Attach(self.number, 0, shard.layout.count, 1))
+            for index, shard in wanted
         ]
         replies = self.jail.exchange("attach", messages, deadline, deposited=True)
         return all(typed_reply(reply, m.Value).value is True for reply in replies)
@@ -127,28 +122,32 @@ class ServedLane(Lane):
             super().send_step(actions, ahead=ahead)
             return
         self._asked_ns = perf_counter_ns()
-        shards, spin_ns = self._shards, self._spin.budget_ns
-        leaves = [actions] if self._flat_actions else slabs.flatten(self._action_space, actions)
-        if len(shards) == 1:
-            payload = [shards[0].ask(leaves, spin_ns)]
-        else:
-            rows = [[leaf[slice(*each)] for leaf in leaves] for each in self.declared.slices]
-            payload = [shard.ask(own, spin_ns) for shard, own in zip(shards, rows, strict=True)]
-        self._send(lambda: self.jail.send_relay(self._step, payload), self._outcome)
+        spin_ns, shards = self._spin.budget_ns, zip(self.shards, self._rows(actions), strict=True)
+        payload = [shard.ask(leaves, spin_ns) for shard, leaves in shards]
+        self._send(lambda: self.jail.send_relay(self._step, payload), self._read)
 
-    def _outcome(self, index: int, frames: Frames) -> Outcome:
-        """Trust: input from the worker, which may call an exception something else."""
-        kind, message = self._shards[index].read(frames)
-        return slabs.RAISED if isinstance(message, m.RaisedException) else kind, message
+    def _read(self, index: int, frames: Frames) -> Outcome:
+        return self.shards[index].read(frames)
+
+    @property
+    def _by_server(self) -> bool:
+        return not self._owed or self._owed[0][2] is None
 
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""
-        self._by_slabs = self._owed[0][2] is not None
-        if not self._by_slabs:
+        self._by_slabs = not self._by_server
+        if self._by_slabs:
             super().wait(deadline)
-            return
-        outcomes: list[Outcome | None]
+        else:
+            Lane.wait(self, deadline)
+
+    def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
+        """See ``Lane``. Trust: input from the worker."""
+        return super().result(infos) if self._by_slabs else Lane.result(self, infos)
+
+    def _outcomes(self, deadline: Deadline) -> tuple[list[Outcome], dict[int, WorkerDiedError]]:
         deaths: dict[int, WorkerDiedError] = {}
+        outcomes: list[Outcome | None]
         try:
             outcomes = [*self.replies(deadline)]
         except RunnersDiedError as error:
@@ -157,81 +156,13 @@ class ServedLane(Lane):
         if 0 < self._spin.budget_ns < self.elapsed_ns:
             self._spin.missed()  # the runner has gone to sleep: count a missed spin
         self._spin.measured(self.elapsed_ns)
-        # what one has raised comes before the infos of others, unless a recovery needs these, or
-        # they were asked for: warnings come with them
-        said = [one[1] for one in outcomes if one is not None]
-        if deaths or self._owed or m.RaisedException not in map(type, said):
-            self._fetch(outcomes, deaths, deadline)
-        if deaths:
-            raise RunnersDiedError(list(map(self._stepped, self._shards, outcomes)), deaths)
-        self._outcomes = [one for one in outcomes if one is not None]
+        said = [outcome or NO_MORE for outcome in outcomes]
+        return said if deaths or said != [NO_MORE] * len(said) else [], deaths
 
-    def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-        """See ``Lane``. Trust: input from the worker."""
-        if not self._by_slabs:
-            return super().result(infos)
-        shards, outcomes = self._shards, self._outcomes
-        if infos is None:
-            infos = {}
-            if outcomes != [_NO_MORE] * len(shards):
-                infos = self.declared.infos(list(map(self._infos_of, shards, outcomes)))
-        parts = [(*shard.rows(), infos) for shard in shards]
-        return parts[0] if len(parts) == 1 else self.declared.joined_steps(parts, infos)
-
-    def _infos_of(self, shard: ServedShard, outcome: Outcome) -> dict[Any, Any]:
-        return infos_of(shard.slabs, outcome, self.declared)
-
-    def _stepped(self, shard: ServedShard, outcome: Outcome | None) -> m.Message | None:
-        """What a shard that lives wrote, as the message that it stands for."""
-        if outcome is None:
+    def _incomplete(self) -> list[int] | None:
+        """Trust: input from the worker."""
+        if not self.jail.client.arrived(self._owed[0][0]):
             return None
-        if isinstance(outcome[1], m.RaisedException):
-            return outcome[1]
-        return m.StepDone(*shard.rows(), self._infos_of(shard, outcome))
-
-    def _fetch(
-        self, outcomes: list[Outcome | None], deaths: dict[int, WorkerDiedError], deadline: Deadline
-    ) -> None:
-        """Put infos in that did not fit the slabs. Who dies meanwhile is added to the deaths."""
-        missing = [i for i, one in enumerate(outcomes) if one is not None and one[0] == slabs.FETCH]
-        if not self._owed:  # else ``answered`` has asked for them
-            if not missing:
-                return
-            self._ask_for(missing)
-        fetched: Sequence[m.Message | None]
-        try:
-            fetched = self.replies(deadline)
-        except RunnersDiedError as error:
-            fetched = error.replies
-            deaths.update(by_shard(error, self._asked))
-        for index, reply in zip(self._asked, fetched, strict=True):
-            if reply is None:
-                outcomes[index] = None
-            elif index in missing:
-                outcomes[index] = slabs.DONE, reply
-
-    def _ask_for(self, shards: Sequence[int], *, ahead: bool = False) -> None:
-        self._asked = shards
-        packed = [self.jail.pack(m.FetchInfos(self.number))] * len(shards)
-        self.send_some("step", [self.runners[index] for index in shards], packed, ahead=ahead)
-
-    def answered(self) -> bool:
-        """See ``Lane``. What has to be fetched is asked for here: a runner may never give it."""
-        if not super().answered():
-            return False
-        if not self._owed or self._owed[0][2] is None:
-            return True
-        if len(self._owed) == 1:
-            lacking = self._lacking()
-            try:
-                if lacking:
-                    self._ask_for(lacking, ahead=True)
-            except EnvHubError:  # whoever waits asks again, and meets the same
-                return True
-        return len(self._owed) == 1 or self.jail.client.arrived(self._owed[1][0])
-
-    def _lacking(self) -> list[int]:
-        """The shards whose infos did not fit, in what has arrived. Trust: input from the worker."""
         parts = self.jail.arrived(self._owed[0][0])
         heads = [bytes(part[0][: _HEAD.size]) for part in parts]
         if not all(len(head) == _HEAD.size for head in heads):
@@ -239,90 +170,95 @@ class ServedLane(Lane):
         return [i for i, head in enumerate(heads) if _HEAD.unpack(head)[0] == slabs.FETCH]
 
 
-class ServedShard:
+class ServedShard(ShardSlabs):
     """Our half of the slabs of one shard, and what the server sent of the other.
 
+    Args:
+        layout, observed: Where actions and results lie.
+
     Attributes:
-        count: Its sub-environments.
-        slabs: The request slab and the reply slab.
-        observations: Its own rows, and no others.
+        observed: As given; these are its own rows, and no others.
+        sizes: Leaves of the actions, and bytes of the request slab and of the observation slab.
     """
 
-    def __init__(
-        self, space: gym.Space[Any], layout: slabs.Layout, observed: slabs.ObservationLayout
-    ) -> None:
-        self._space, self._layout, self._observed = space, layout, observed
-        request = bytearray(layout.request_bytes)
-        self._reply = memoryview(bytearray(slabs.REPLY_BYTES))
-        self._received = memoryview(bytearray(observed.total_bytes))
-        self._plain_bytes = _HEAD.size + observed.total_bytes
+    def __init__(self, layout: slabs.Layout, observed: slabs.ObservationLayout) -> None:
+        request, reply = bytearray(layout.request_bytes), bytearray(slabs.REPLY_BYTES)
+        super().__init__(layout, request, memoryview(reply))
+        self.observed = observed
+        self._received: Sequence[Buffer] = ()
         leaves = len(layout.actions)
+        self.sizes = leaves, layout.request_bytes, observed.total_bytes
         self._words = memoryview(request)[slabs.OWN_BYTES : (slabs.DTYPES + leaves) * 8]
-        self._actions = memoryview(request)[slabs.HEADER_BYTES : layout.message]
-        self.slabs = ShardSlabs(layout, request, self._reply)
-        self.observations = ObservationSlab(space, observed, self._received)
-        self._assemble = slabs.assembler(space)
-        self._pieces: list[Buffer] = []
-
-    def again(self) -> ServedShard:
-        """The same with nothing in it."""
-        return ServedShard(self._space, self._layout, self._observed)
-
-    @property
-    def count(self) -> int:
-        """Its sub-environments."""
-        return self._layout.count
-
-    @property
-    def sizes(self) -> tuple[int, int, int]:
-        """Leaves of the actions, and bytes of the request slab and of the observation slab."""
-        layout = self._layout
-        return len(layout.actions), layout.request_bytes, self._observed.total_bytes
+        self._written = memoryview(request)[slabs.HEADER_BYTES : layout.message]
 
     def ask(self, leaves: Sequence[Any], spin_ns: int) -> bytes:
         """What the server writes into the request slab for a step."""
-        self.slabs.write(leaves, (0, spin_ns, 0))
-        return b"".join((self._words, self._actions))
+        self.write(leaves, (0, spin_ns, 0))
+        return b"".join((self._words, self._written))
 
     def read(self, frames: Frames) -> Outcome:
-        """How a step went; the rest lies in the slabs. Trust: input from the worker."""
+        """How a step went, and what is in the slabs. Trust: input from the worker."""
         first = memoryview(frames[0])
-        if len(first) == self._plain_bytes and first[: _HEAD.size] == _PLAIN:
-            self._received[:] = first[_HEAD.size :]
-            self._pieces = []
-            return _NO_MORE
         if len(first) < _HEAD.size:
             raise RemoteProtocolError("the worker sent less than the outcome of a step")
         kind, length = _HEAD.unpack_from(first)
-        size = self.slabs.known if kind == slabs.COLUMNS else min(length, slabs.INFO_BYTES)
-        self._reply[_HEAD_AT : _HEAD_AT + _HEAD.size] = first[: _HEAD.size]
+        size = self.known if kind == slabs.COLUMNS else min(length, slabs.INFO_BYTES)
         infos, rest = first[_HEAD.size : _HEAD.size + size], first[_HEAD.size + size :]
-        pieces: list[Buffer] = [rest, *frames[1:]]
-        if len(infos) < size or sum(map(len, pieces)) != len(self._received):
+        received: list[Buffer] = [rest, *frames[1:]]
+        if len(infos) < size or sum(map(len, received)) != self.observed.total_bytes:
             raise RemoteProtocolError("the worker sent slabs of another size than was agreed on")
+        self._received = received
+        if (kind, length) == _PLAIN:
+            return NO_MORE
+        self._reply[_HEAD_AT : _HEAD_AT + _HEAD.size] = first[: _HEAD.size]
         self._reply[slabs.INFOS : slabs.INFOS + size] = infos
-        # of a large batch, what has a place of its own is copied there, and once
-        self._pieces = pieces if len(self._received) > LARGE_BYTES else []
-        start = self._observed.results if self._pieces else 0
-        _copy(pieces, start, self._received[start:])
-        return self.slabs.outcome()
+        return self.outcome()
 
-    def rows(self) -> tuple[Any, Any, Any, Any]:
-        """Observation, rewards, terminations and truncations; the caller's own."""
-        return self._observation(), *self.observations.results()
+    def leaves(self) -> list[Any]:
+        """Its observations."""
+        return [self._array(leaf.dtype, leaf.shape, leaf.offset) for leaf in self.observed.leaves]
 
-    def _observation(self) -> Any:
-        pieces, self._pieces = self._pieces, []
-        if not pieces:
-            return self.observations.take()
-        made = []
-        for leaf in self._observed.leaves:
-            flags = leaf.dtype.kind == "b"
-            # cast, not viewed: a hostile byte of 2 would make a bool that is neither
-            array = np.empty(leaf.shape, np.uint8 if flags else leaf.dtype)
-            _copy(pieces, leaf.offset, array.reshape(-1).view(np.uint8).data)
-            made.append(array.astype(np.bool_) if flags else array)
-        return self._assemble(made)
+    def results(self) -> tuple[Any, Any, Any]:
+        """Its rewards, terminations and truncations; what was received is gone then."""
+        start, count = self.observed.results, self.layout.count
+        rewards = self._array(_REWARD, (count,), start)
+        flags = self._array(_FLAG, (2 * count,), start + rewards.nbytes)
+        self._received = ()  # what a large batch took is memory for the next
+        return rewards, flags[:count], flags[count:]
+
+    def _array(self, dtype: np.dtype[Any], shape: tuple[int, ...], start: int) -> Any:
+        # cast, not viewed: a hostile byte of 2 would make a bool that is neither
+        raw = _BYTE if dtype is _FLAG else dtype
+        if len(self._received) == 1:
+            return np.ndarray(shape, raw, self._received[0], start).astype(dtype)
+        array = np.empty(shape, raw)
+        _copy(self._received, start, array.reshape(-1).view(_BYTE).data)
+        return array.astype(dtype, copy=False)
+
+
+class ReceivedBatch:
+    """The results of all shards, out of frames: the caller's own.
+    ``space``: the single observation space; ``shards``: what was received of each.
+    """
+
+    def __init__(self, space: gym.Space[Any], shards: Sequence[ServedShard]) -> None:
+        self._assemble = slabs.assembler(space)
+        self._shards = shards
+
+    def take(self) -> Any:
+        """The observations, in the structure of the space."""
+        leaves = zip(*(shard.leaves() for shard in self._shards), strict=True)
+        return self._assemble(list(map(_joined, leaves)))
+
+    def results(self) -> tuple[Any, Any, Any]:
+        """Rewards (float64), terminations and truncations (bool), ``(num_envs,)``; once a step."""
+        columns = zip(*(shard.results() for shard in self._shards), strict=True)
+        rewards, over, cut = map(_joined, columns)
+        return rewards, over, cut
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _copy(pieces: Sequence[Buffer], start: int, into: memoryview) -> None:

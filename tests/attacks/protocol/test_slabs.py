@@ -147,9 +147,9 @@ def test_an_impossible_header_is_refused(
 ) -> None:
     """Words out of range never become a slice or an allocation, of steps or messages."""
     if asked == "outcome":
-        shard.ask([np.zeros((2, 2), np.float32)], (0, 0, 0))
+        shard.write([np.zeros((2, 2), np.float32)], (0, 0, 0))
     else:
-        shard.tell(m.pack(m.Render(1)), (0, 0, 0))
+        shard.write_message(m.pack(m.Render(1)), (0, 0, 0))
     words = f"struct.pack('QQ', {outcome}, {length})"
     attack(shard, f"os.pwrite(reply, {words}, {slabs.OUTCOME * 8})")
     with pytest.raises(RemoteProtocolError):
@@ -168,7 +168,7 @@ def _packet(*frames: bytes) -> bytes:
 
 def answers(shard: LaneShard, answer: str) -> None:
     """Tell the jail something; it answers with these bytes, a Python literal."""
-    shard.tell(m.pack(m.Render(1)), (0, 0, 0))
+    shard.write_message(m.pack(m.Render(1)), (0, 0, 0))
     attack(
         shard,
         f"answer = {answer}\n"
@@ -205,7 +205,7 @@ def test_an_honest_answer_is_read(shard: LaneShard) -> None:
 @pytest.mark.parametrize("bytes_", ["b'\\x80\\x04.'", "os.urandom(64)", "b'\\xff' * 64"])
 def test_garbage_for_infos_is_refused(shard: LaneShard, bytes_: str) -> None:
     """What lies in the info area is decoded by the same suspicious code as a message."""
-    shard.ask([np.zeros((2, 2), np.float32)], (0, 0, 0))
+    shard.write([np.zeros((2, 2), np.float32)], (0, 0, 0))
     attack(
         shard,
         f"os.pwrite(reply, {bytes_}, {slabs.INFOS})\n"
@@ -216,7 +216,7 @@ def test_garbage_for_infos_is_refused(shard: LaneShard, bytes_: str) -> None:
 
 
 def test_columns_without_a_schema_are_refused(shard: LaneShard) -> None:
-    shard.ask([np.zeros((2, 2), np.float32)], (0, 0, 0))
+    shard.write([np.zeros((2, 2), np.float32)], (0, 0, 0))
     attack(shard, f"os.pwrite(reply, struct.pack('QQ', {slabs.COLUMNS}, 0), {slabs.OUTCOME * 8})")
     kind, message = shard.outcome()
     assert (kind, message) == (slabs.COLUMNS, None)
@@ -272,7 +272,7 @@ def test_the_answer_to_a_step_is_copied_before_it_is_looked_at(
     assert layout is not None
     ring = SlotRing(1, SLOT, SLOT)
     shard = LaneShard(layout, ring.fd)
-    shard.tell(m.pack(m.Step(1, np.zeros((2, 2)))), (0, 0, 0), ring)
+    shard.write_message(m.pack(m.Step(1, np.zeros((2, 2)))), (0, 0, 0), ring)
     packet = _packet(*map(bytes, m.pack(m.Value(np.ones(20_000, bool)))))
     assert len(packet) < SLOT
     length = len(packet) if size is None else size

@@ -18,7 +18,7 @@ from envhub_sandbox.session import requests
 from envhub_sandbox.session.parts import in_flight, worker_queue
 from envhub_sandbox.transport import connection
 from envhub_sandbox.transport import lane as relay_lane
-from envhub_sandbox.transport.shared_memory import served_lane
+from envhub_sandbox.transport.shared_memory import served_lane, slab_lane
 from envhub_worker.protocol.lifecycle import State
 from tests.support import inside
 from tests.support.in_process.interrupts import before_line
@@ -225,13 +225,14 @@ def test_ctrl_c_ends_a_wait_and_loses_nothing(gates: Gates) -> None:
     assert ids(env.recv(2)) == [0, 1]
 
 
+_OVER_A_SERVER = served_lane, slab_lane, relay_lane, connection
 # in the client, over either lane; and further down, over the server
 _PLACES = [
     ("auto", in_flight, 1),
     ("auto", worker_queue, 2),
     ("auto", requests, 1),
     ("frames", in_flight, 2),
-    *(("frames", module, 2) for module in (served_lane, relay_lane, connection)),
+    *(("frames", module, 2) for module in _OVER_A_SERVER),
 ]
 
 
@@ -272,8 +273,7 @@ def test_ctrl_c_anywhere_gives_no_step_anothers_results(
     monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 0.5)  # where one is lost
     env = gates.env(2)
     # between two moments that are tried, of some hundreds
-    over_a_server = module in (served_lane, relay_lane, connection)
-    lines = 23 if over_a_server else 3
+    lines = 23 if module in _OVER_A_SERVER else 3
     line, came = 0, True
     while came:
         number = 3 * line % 990 + 1

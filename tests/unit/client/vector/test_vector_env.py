@@ -79,7 +79,7 @@ class _Runner:
 
 def ask(lane: LaneShard, dtype: str, slot: int) -> None:
     """Ask for a step."""
-    lane.ask([np.zeros(1, dtype)], (slot, 0, 0))
+    lane.write([np.zeros(1, dtype)], (slot, 0, 0))
 
 
 @pytest.mark.parametrize("afterwards", [("int64", 0), ("int32", 1)])
@@ -98,7 +98,7 @@ def test_a_runner_is_told_all_after_an_interrupt(what: str, afterwards: tuple[st
             if what == "step":
                 ask(lane, "int32", 1)
             else:
-                lane.tell([b"message"], (1, 0, 0))
+                lane.write_message([b"message"], (1, 0, 0))
 
         came = before_line(client_slabs.__file__, line, act)
         assert runner.asked(dtype, slot) == expected

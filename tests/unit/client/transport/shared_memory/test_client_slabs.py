@@ -118,14 +118,6 @@ def test_a_hostile_byte_makes_no_third_boolean(
         assert mask.all()
 
 
-def test_received_memory_is_shared_with_nobody() -> None:
-    layout = slabs.observation_layout(BOX, COUNT, 1)
-    received = memoryview(bytearray(layout.total_bytes))
-    slab = ObservationSlab(BOX, layout, received)
-    slabs.view(received, layout.leaves[0])[...] = 3
-    assert (slab.fd, slab.take().tolist()) == (-1, [[3.0] * 3] * COUNT)
-
-
 # --- Descriptors on their way to the server: a connection that is lost in between is made again
 
 

@@ -22,7 +22,11 @@ from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.shared_memory.served_lane import ServedLane, ServedShard
+from envhub_sandbox.transport.shared_memory.served_lane import (
+    ReceivedBatch,
+    ServedLane,
+    ServedShard,
+)
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.shared_memory import slabs
@@ -50,7 +54,8 @@ class Both:
         self.observed = slabs.observation_layout(space, COUNT, 1)
         assert self.layout is not None
         assert self.observed is not None
-        self.shard = ServedShard(space, self.layout, self.observed)
+        self.shard = ServedShard(self.layout, self.observed)
+        self.batch = ReceivedBatch(space, [self.shard])
         self.server = ServedSlabs(*self.shard.sizes)
         self.memory = [
             memoryview(memory(fd, size))
@@ -92,7 +97,8 @@ def test_a_batch_is_what_the_runner_wrote(space: Any) -> None:
     both.ask(np.array([0, 1, 2]), np.ones((COUNT, 2), np.float64))
     both.memory[2][:] = wrote = os.urandom(both.observed.total_bytes)
     assert both.answer() == (slabs.DONE, None)
-    observation, rewards, terminations, truncations = both.shard.rows()
+    observation = both.batch.take()
+    rewards, terminations, truncations = both.batch.results()
     leaves = [observation] if space is SMALL else list(observation.values())
     for leaf, array in zip(both.observed.leaves, leaves, strict=True):
         raw = wrote[leaf.offset : leaf.offset + array.nbytes]
@@ -129,7 +135,7 @@ def test_a_space_without_members_has_no_actions_to_write() -> None:
     layout, observed = slabs.layout_of(spaces.Dict({}), 1), slabs.observation_layout(SMALL, 1, 1)
     assert layout is not None
     assert observed is not None
-    assert ServedShard(SMALL, layout, observed).ask([], 0)
+    assert ServedShard(layout, observed).ask([], 0)
 
 
 def test_columns_follow_their_schema() -> None:
@@ -140,13 +146,13 @@ def test_columns_follow_their_schema() -> None:
     both.ask(np.zeros(COUNT, int), np.zeros((COUNT, 2)))
     columns = np.array([7, 8, 9]).tobytes().ljust(64, b"\0") + b"\1\2\0"
     assert both.answer(slabs.COLUMNS, columns, length=0) == (slabs.COLUMNS, None)
-    found = both.shard.slabs.columns()
+    found = both.shard.columns()
     assert found["a"].tolist() == [7, 8, 9]
     assert found["_a"].tolist() == [True, True, False]
-    fresh = both.shard.again()
-    assert (both.shard.slabs.known > 0, fresh.slabs.known) == (True, 0)
+    fresh = ServedShard(both.layout, both.observed)
+    assert (both.shard.known > 0, fresh.known) == (True, 0)
     with pytest.raises(RemoteProtocolError, match="before their schema"):
-        fresh.slabs.columns()
+        fresh.columns()
 
 
 class Served:
