@@ -90,7 +90,7 @@ def _is_nvidias(node: str) -> bool:
 
 
 def _address(node: str, host: HostFiles) -> str:
-    """The PCI address of what a node belongs to; empty if it has none, or none is known."""
+    """The PCI address of the GPU that a device node belongs to; empty if unknown."""
     name = posixpath.basename(node)
     if not _is_nvidias(node):
         folder = resolve(f"/sys/class/drm/{name}", host, {})
@@ -115,7 +115,7 @@ def _granted(chosen: Collection[tuple[str, ...]], host: HostFiles) -> GpuGrant:
 
 
 def _folders(node: str, host: HostFiles) -> list[str]:
-    """Where drivers look up this one device: its folder, by the names that lead to it."""
+    """Paths in /sys under which drivers look up the GPU of this device node."""
     address = _address(node, host)
     folders = [f"/sys/bus/pci/devices/{address}"] if address else []
     if not _is_nvidias(node):

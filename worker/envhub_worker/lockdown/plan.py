@@ -54,7 +54,7 @@ def plan(
 
 
 def _check(confinement: Confinement, machine: str, landlock_abi: int) -> None:
-    """Refuse what there cannot be."""
+    """Raise ``LayerUnavailableError`` for a profile that cannot be had, or not with its options."""
     for name, value, permitted in (
         ("profile", confinement.profile, PROFILES),
         ("network", confinement.network, NETWORKS),
@@ -126,7 +126,7 @@ def _landlock_layer(abi: int) -> Layer:
 
 
 def _uncounted(confinement: Confinement, memory: str, namespaced: bool) -> str:
-    """What of a jail's memory nothing counts here, named for the report."""
+    """Kinds of a jail's memory that nothing counts here, for the report."""
     names = ["file locks"]
     if confinement.gpu is not False:
         names.append("memory of the GPU's driver")

@@ -176,7 +176,7 @@ class Server:
         self.reply(Asker(identity, number, b"", key), refused.reply)
 
     def _dispatch(self, asker: Asker, request: m.Message, arrived: Incoming) -> m.Message | None:
-        """The reply; None where it was sent, or comes later. Raises ``AnsweredError``."""
+        """The reply; None if it was sent, or comes later. Raises ``AnsweredError``."""
         if isinstance(request, m.Hello):
             return self._hello(request, arrived)
         payload = arrived.frames[1:]

@@ -222,7 +222,7 @@ class Init:
             os.close(listener)
 
     def _note(self, request: notify.Request) -> None:
-        """Report what was tried, each thing once; a runner's own test of its denials is none."""
+        """Report an attempt, each kind once, but not those of a runner's self-test."""
         # it may have reported a moment ago, and be a stranger's since
         self._read_report(request.caller)
         runner = self._runners.get(request.caller)
@@ -249,7 +249,7 @@ class Init:
             self._channel.send({"event": "denied", "call": call, "detail": detail})
 
     def _read_report(self, pid: int) -> None:
-        """What a runner has reported, if ``pid`` is one that is still to be confined."""
+        """Take a runner's report about its confinement; nothing if ``pid`` is confined."""
         runner = self._runners.get(pid)
         if runner is None or runner.status is None:
             return

@@ -112,7 +112,7 @@ def start_display(spec: JailSpec) -> None:
 
 
 def _line(ready: int) -> bytes:
-    """What Xvfb says in time: the number of its display, and the end of the line apart."""
+    """The number of the display that Xvfb writes; empty or incomplete if it ends or is too slow."""
     text = b""
     while b"\n" not in text and select.select([ready], [], [], _START_S)[0]:
         piece = os.read(ready, 16)

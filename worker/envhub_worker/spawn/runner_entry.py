@@ -77,7 +77,7 @@ def _run(jail: JailContext, fds: list[int], init: Channel, runners: int) -> int:
 def _main(
     jail: JailContext, runners: int
 ) -> Callable[[socket.socket, JailSpec, list[int]], int | None]:
-    """What the runner runs, imported with the packages that it is to have."""
+    """Import the runner's main function, after the environment's own packages if it has any."""
     config = jail.common.config
     if not config.packages:
         return _resolve(config.target)
@@ -151,11 +151,11 @@ def _flush() -> None:
 
 
 def _bring_in(folder: str, home: str) -> None:
-    """Make this confined process one of an environment whose packages are ``folder``.
+    """Turn this confined process into an interpreter with the packages in ``folder``.
 
-    Behind the standard library, as the packages of any interpreter, with their ``.pth`` files; and
-    what of ``site`` a program may expect. What it starts as ``sys.executable`` has them as well.
-    ``home``: the jail's own home. All of its runners make the same there.
+    They come behind the standard library, with their ``.pth`` files and the names that ``site``
+    adds to builtins. Programs that it starts as ``sys.executable`` have them as well.
+    ``home``: the jail's own home, where each of its runners makes the same environment.
     """
     environment = f"{home}/.environment"
     _make_environment(environment, folder)

@@ -289,7 +289,7 @@ class Jails:
         return entry if entry is not None and entry.session == session else None
 
     def _owned(self, asker: Asker, number: int, operation: str = "") -> JailRecord:
-        """A jail of the asker's that lives; raises the reply where it has none."""
+        """The asker's living jail of this number. Raises the reply if there is none."""
         entry = self._found(asker.session, number)
         if entry is None:
             raise RefusedError("WorkerDiedError", f"there is no jail {number}; it has been closed")
@@ -351,7 +351,7 @@ class Jails:
         return spawner
 
     def _end_idle(self) -> None:
-        """A client with ever new policies does not fill the machine with warm interpreters."""
+        """End idle zygotes over the limit: ever new policies would fill the memory."""
         used = {entry.zygote for entry in self._jails.values() if not entry.released}
         idle = [zygote for zygote in self._spawners if zygote not in used]
         for zygote in idle[: max(0, len(idle) - MAX_IDLE_ZYGOTES)]:
@@ -427,7 +427,7 @@ def _can_step(link: RunnerLink | None, frames: list[bytes]) -> bool:
 def _targets(
     entry: JailRecord, request: m.Relay, payload: list[bytes]
 ) -> list[tuple[int, list[bytes]]] | None:
-    """Which runner gets which frames; None if the request does not add up."""
+    """The frames for each runner; None if the parts do not match the runners or the frames."""
     targets: dict[int, list[bytes]] = {}
     start = 0
     for part in request.parts:

@@ -289,7 +289,7 @@ _STATES = {b"R": "running", b"S": "waiting", b"D": "waiting", b"T": "stopped", b
 
 
 def _state_of(pid: int) -> str:
-    """What the kernel says that a runner is doing; a busy environment cannot say so itself."""
+    """The state of a runner by the kernel: a busy environment cannot tell its own."""
     try:
         return _STATES.get(procfs.stat(pid)[0], "gone")
     except (OSError, IndexError):

@@ -81,7 +81,7 @@ class RunnerLink:
         self.flush()
 
     def _send_fds(self, request_id: int, frames: Sequence[Buffer], fds: Sequence[int]) -> None:
-        """Descriptors belong to a place in the stream, so their small packet goes in one piece."""
+        """Send a small packet in one piece: its descriptors arrive with its first byte."""
         if self._unsent:
             raise RuntimeError("the runner is still being sent another request")
         data = b"".join(map(bytes, pack_packet(request_id, frames)))
@@ -133,7 +133,7 @@ class RunnerLink:
         return answers
 
     def _check_owed(self, request_id: int) -> None:
-        """Before memory is allocated for a reply that was not asked for."""
+        """Refuse a reply that nobody asked for, before memory is allocated for it."""
         expected = next(iter(self.pending), None)
         if request_id != expected:
             raise RemoteProtocolError(

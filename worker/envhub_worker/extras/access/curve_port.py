@@ -194,7 +194,7 @@ class ConnectionLimiter:
         return frozenset(self._wires.values())
 
     def _shut(self) -> None:
-        """Without descriptors or permission it stays open, and the next one tries again."""
+        """Drop new connections. If that fails, the next connection tries again."""
         listener = None
         try:
             listener = _listener(str(self._router.get_string(zmq.LAST_ENDPOINT)))

@@ -260,7 +260,7 @@ class Packages:
     # --- orders --------------------------------------------------------------------------------
 
     def _reply(self, order_id: OrderId) -> m.Packages | None:
-        """The answer to an order that has a result; None where it has none, or none any more."""
+        """The answer to an order; None if it has no result, or one that no longer holds."""
         order = self._orders.get(order_id)
         if order is None or order.result is None:
             return None
@@ -302,7 +302,7 @@ class Packages:
         return {home: order.program for (home, _), order in orders if order.program is not None}
 
     def _waiting(self) -> list[OrderId]:
-        """Who waits, in turn: first the key for which nothing was begun for longest."""
+        """Waiting orders in turn: first that of the key for which nothing was begun for longest."""
         orders = self._orders.items()
         waiting = [name for name, order in orders if order.program is None and order.result is None]
         return sorted(waiting, key=self._last_begun)

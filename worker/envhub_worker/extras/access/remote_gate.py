@@ -175,7 +175,7 @@ class RemoteGate(Gate):
         )
 
     def _hub_copies(self, key: bytes, request: m.OpenJail) -> tuple[object, ...]:
-        """With the paths of snapshots that this client has brought, and no other paths."""
+        """The request's repositories with the paths of snapshots that this client has uploaded."""
         try:
             trees = {copy.tree for copy in request.repositories if copy.tree}
         except ProtocolError as error:

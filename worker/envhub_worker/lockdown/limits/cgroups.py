@@ -111,7 +111,7 @@ class Tree:
 
 
 def _made_and_locked(folder: str, *, exist_ok: bool = False) -> int:
-    """Make a group; gives the descriptor that holds its lock."""
+    """Create a group and return the descriptor that holds its lock."""
     while True:
         os.makedirs(folder, exist_ok=exist_ok)
         # another server may find it before it is locked, and remove it
@@ -124,7 +124,7 @@ def _made_and_locked(folder: str, *, exist_ok: bool = False) -> int:
 
 
 def _remove_abandoned(folders: Sequence[str]) -> None:
-    """Remove what servers that were killed have left; the kernel keeps what has processes."""
+    """Remove groups of servers that were killed. The kernel keeps those with processes."""
     for folder in folders:
         for name in os.listdir(folder):
             if name.startswith(_PREFIX):

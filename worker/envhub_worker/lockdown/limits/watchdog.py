@@ -143,9 +143,9 @@ def _add_process(usage: Usage, pid: int) -> None:
 
 
 def _add_mappings(usage: Usage, pid: int) -> None:
-    """Of each shared object what is mapped, or what the filter lets be made, if that is more.
+    """Count each shared object by its largest mapping, but no less than the filter lets be made.
 
-    It keeps pages that are not mapped any more, as long as one of them is.
+    Shared memory keeps its unmapped pages as long as one page of it is mapped.
     """
     maps = procfs.content(f"/proc/{pid}/maps")
     usage.kernel += maps.count(b"\n") * _MAPPING

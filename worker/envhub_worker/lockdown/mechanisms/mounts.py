@@ -83,7 +83,7 @@ def enter_root(plan: RootPlan, root: str, copied: Sequence[str], user: int | Non
 
 
 def _take(paths: Iterable[str], attributes: int) -> dict[str, int]:
-    """Path to a detached copy of what is there."""
+    """For each path a detached copy of the mount tree there."""
     trees = {}
     for path in paths:
         trees[path] = kernel.clone_tree(path)
@@ -93,7 +93,7 @@ def _take(paths: Iterable[str], attributes: int) -> dict[str, int]:
 
 
 def _take_for(user: int, paths: Iterable[str]) -> dict[str, int]:
-    """As ``_take``, with root's files as those of ``user``; without what cannot show them so."""
+    """As ``_take``, with root's files owned by ``user``; without paths that cannot be mapped so."""
     trees: dict[str, int] = {}
     with contextlib.suppress(OSError):
         users = namespaces.mapped_to(user)
@@ -108,7 +108,7 @@ def _take_for(user: int, paths: Iterable[str]) -> dict[str, int]:
 
 
 def _put(trees: Mapping[str, int], below: str = "") -> None:
-    """Attach each copy where it was taken, below ``place``."""
+    """Attach each tree at its own path inside the folder ``below``."""
     for path, tree in trees.items():
         target = below + path
         if os.path.isdir(f"/proc/self/fd/{tree}"):
@@ -258,7 +258,7 @@ def _mount_views(snapshot: str, packages: str) -> View:
 
 
 def _mount_copy_on_write(path: str, upper: str, skeleton: Sequence[str], view: View) -> None:
-    """Have what is written to ``path`` land in ``upper``, where this host has overlays."""
+    """Mount an overlay on ``path`` whose writes go to ``upper``, or note why the host refuses."""
     below = os.open(path, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         mount_overlay(path, (*skeleton, path), upper)

@@ -80,7 +80,7 @@ def _stop_below(root: int, keep: Collection[int]) -> set[int]:
 
 
 def _has_ended(pid: int) -> bool:
-    """Whether every thread has; ``/proc`` calls it a zombie when the first one has."""
+    """Whether every thread has ended; ``/proc`` shows a zombie as soon as the first one has."""
     try:
         pidfd = os.pidfd_open(pid)
     except OSError as error:

@@ -81,7 +81,7 @@ def assemble(items: Sequence[Item]) -> list[BpfInstruction]:
 
 
 def _branch(item: Branch, following: int, labels: dict[str, int]) -> list[BpfInstruction]:
-    """``following``: the number of instructions behind it."""
+    """The instructions of a branch; ``following`` is the number of instructions behind it."""
     skips = {end: following - labels[end] for end in item.targets}
     if max(skips.values(), default=0) <= 255:
         if_true, if_false = (skips.get(end or "", 0) for end in (item.if_true, item.if_false))

@@ -130,7 +130,7 @@ def _compare(check: Check, otherwise: str) -> list[Item]:
 
 
 def _returns(items: list[Item]) -> list[Item]:
-    """One return per verdict that some branch names."""
+    """A labelled return for each verdict that is a branch's target."""
     targets = {
         target
         for item in items
@@ -172,10 +172,10 @@ def install(compiled: bytes, *, brokered: bool = False) -> int:
 
 
 def _listener(index: int) -> int:
-    """Install the program there. A call that asks is no slow call, which signals interrupt.
+    """Install the program at ``index``, so that no signal interrupts a call that waits for init.
 
-    An older kernel knows no such flag: there a signal takes its caller out of it, with EINTR, or
-    to ask anew where its handler has calls restarted.
+    Kernels before 5.19 lack the flag for that: there a signal ends the call with EINTR, or makes
+    it ask again if the signal's handler restarts calls.
     """
     try:
         return kernel.syscall("seccomp", _SET_MODE_FILTER, _NEW_LISTENER | WAIT_KILLABLE, index)

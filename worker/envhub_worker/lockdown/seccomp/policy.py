@@ -238,11 +238,11 @@ def _filtered() -> dict[str, Verdict]:
 
 
 def _fcntls() -> ByArguments:
-    """What reaches others through a file that is only open for reading is denied.
+    """Deny operations that affect other processes through a file that is open for reading.
 
-    A lease makes everybody else wait who opens it, a delegation of a folder too; notices tell
-    what others do in a folder; an owner is whom the kernel signals. The pages of pipes are
-    counted per user: a few large ones leave tiny ones to the user's other programs.
+    A lease on a file, or a delegation of a folder, makes everybody wait who opens it. Notices tell
+    what others do in a folder. The kernel sends signals to a file's owner. Pages of pipes are
+    counted per user: a few large pipes would leave only tiny ones to the user's other programs.
     """
     owners = (_F_SETOWN, _F_SETSIG, _F_SETOWN_EX)
     others = (_F_SETPIPE_SZ, _F_SET_RW_HINT, _F_SET_FILE_RW_HINT)
@@ -251,13 +251,13 @@ def _fcntls() -> ByArguments:
 
 
 def _by_option(arg: int, allowed: Iterable[int], denied: Iterable[int] = ()) -> ByArguments:
-    """A call whose argument ``arg`` says what it does; an option of neither list is invalid."""
+    """Decide by the option in argument ``arg``; one in neither list answers EINVAL."""
     rules = [((Check(arg, option),), ALLOW) for option in allowed]
     return ByArguments((*rules, *(((Check(arg, option),), EPERM) for option in denied)), EINVAL)
 
 
 def _socket_options() -> ByArguments:
-    """Buffers keep the size that init counts them with; filters take the kernel's own memory."""
+    """Pretend to resize buffers, whose default size init counts; deny filters: kernel memory."""
 
     def rules(verdict: int, *options: int) -> Rules:
         return tuple(((Check(1, _SOL_SOCKET), Check(2, option)), verdict) for option in options)
@@ -268,10 +268,10 @@ def _socket_options() -> ByArguments:
 
 
 def _unmeasurable() -> dict[str, Verdict]:
-    """Memory that no process need have open or mapped, so that init could not find it.
+    """Deny memory that init cannot find, because no process has it open or mapped.
 
-    A file without a name waits in a socket; of shared memory all but a page is unmapped. Programs
-    fall back to files in the scratch, whose size is bounded.
+    A memfd can wait in a socket, and shared memory keeps all pages while one of them is mapped.
+    Programs fall back to files in the scratch, whose size is bounded.
     """
     anonymous = Check(3, _MAP_SHARED | _MAP_ANONYMOUS, _MAP_SHARED | _MAP_ANONYMOUS)
     small = Check(1, 0, 0xFFFFFFFF & ~(SHARED_BYTES - 1), wide=True)
@@ -291,8 +291,10 @@ def _ioctls() -> ByArguments:
 
 
 def _sockets(local: bool, network: str, *, own: bool) -> dict[str, Verdict]:
-    """Local sockets by name only where no other process has such names (``local``).
-    ``own``: the network namespace is the jail's own, and its user namespace's.
+    """Verdicts for sockets.
+
+    ``local``: sockets may have names in the file system, as no other process has such names.
+    ``own``: the jail has a network namespace of its own, which its user namespace owns.
     """
     internet = network != "none"
     verdicts: dict[str, Verdict] = {

@@ -142,7 +142,7 @@ def _threads_of(uid: int) -> int:
 
 
 def _leave_the_zygote() -> None:
-    """Own no namespace any more: the next user namespace is below the one that owns them."""
+    """Give up the zygote's namespaces by entering a user namespace below the one that owns them."""
     namespaces.enter_user_namespace(namespaces.INSIDE_UID, namespaces.INSIDE_UID)
     namespaces.forbid_what_is_counted()
     process.drop_capabilities()

@@ -163,7 +163,7 @@ def resource_limits(limits: Limits, processes: int | None) -> dict[int, tuple[in
 
 
 def _self_test(jail: JailContext, descriptors: Iterable[int]) -> None:
-    """Try what it must not be able to do, as far as that can be tried without harm.
+    """Try everything that a runner must not be able to do and that does no harm.
     Raises ``LayerUnavailableError``: layer ``self-test``: a denial does not hold.
     """
     _hold("no capability is left", process.held_capabilities() == 0)
@@ -204,12 +204,12 @@ def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
 
 
 def _make_unnamed(path: str, folder: int | None = None) -> None:
-    """A file without a name: if it can be made, it is gone at once."""
+    """Try to create a file without a name, which the kernel removes at once."""
     os.open(path, os.O_TMPFILE | os.O_WRONLY, 0o600, dir_fd=folder)
 
 
 def _stays_inside(path: str, shared: int) -> bool:
-    """Make a file in a view, and look for it in the folder ``shared``; which takes none itself."""
+    """Whether a file made in a view is missing in the folder ``shared``, which refuses files."""
     name = f".{secrets.token_hex(16)}"
     try:
         with contextlib.suppress(OSError):  # where a runner before filled the scratch, for example

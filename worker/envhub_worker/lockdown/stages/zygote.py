@@ -181,7 +181,7 @@ def _check_interpreter() -> None:
 
 
 def _check_packages(folder: str) -> None:
-    """Of the top level; of what lies deeper the import says that it is there, and closed."""
+    """Check that the top level is readable. An import names a deeper file that is not."""
     why = ""
     try:
         for name in os.listdir(folder):
@@ -200,7 +200,7 @@ def _check_packages(folder: str) -> None:
 
 
 def _be_the_first_process() -> None:
-    """Go on as the first process of the new pid namespace; this one stays to be its parent."""
+    """Fork: the child goes on as pid 1 of the new pid namespace, and we wait for its end."""
     child = os.fork()
     if child:
         process.close_all_but({2})

@@ -206,7 +206,7 @@ def parse_descriptor(descriptor: bytes) -> tuple[np.dtype[Any], tuple[int, ...],
 
 @lru_cache(maxsize=1024)
 def _descriptors(dtype: np.dtype[Any], shape: tuple[int, ...]) -> tuple[Any, Any, bool]:
-    """The extensions for tail and for frame, and whether the bytes travel as they are."""
+    """Descriptors for the tail and for a frame, and whether the bytes are sent unchanged."""
     plain = dtype.isnative and dtype.kind not in "US"
     # numpy's empty strings have no width; they travel as one character.
     head = describe_dtype(dtype if dtype.itemsize else np.dtype((dtype.kind, 1)))
@@ -372,7 +372,7 @@ def tensor_bits(tensor: Any) -> tuple[str, Array | None]:
 
 @lru_cache(maxsize=64)
 def _tensor_form(dtype: Any, layout: Any) -> tuple[str, bool]:
-    """The name of a dtype, and whether the layout is the usual one."""
+    """The name of a tensor's dtype without ``torch.``, and whether the tensor is dense."""
     return str(dtype).rpartition(".")[2], str(layout) == "torch.strided"
 
 

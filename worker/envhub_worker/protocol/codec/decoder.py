@@ -190,7 +190,7 @@ class Decoder:
 
 
 def _owned(value: Any) -> Any:
-    """A plain value with copies of its arrays, which nobody writes while they are checked."""
+    """The value with copies of its arrays, so that the peer cannot change them after a check."""
     if type(value) is dict:
         return {key: _owned(item) for key, item in value.items()}
     if type(value) is list or type(value) is tuple:

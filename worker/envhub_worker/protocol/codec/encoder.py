@@ -132,7 +132,7 @@ def _numpy_writer() -> Callable[[Encoder, Any], object]:
 
 
 def _headed(code: int, *names: str) -> Callable[[Encoder, Any], object]:
-    """A head and the attributes of these names; the elements, where none is named."""
+    """Writes a list of the type code and the named attributes, or the elements if none is named."""
     head = _HEADS[code]
     parts = attrgetter(*names) if names else iter
 

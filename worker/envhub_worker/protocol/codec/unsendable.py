@@ -172,7 +172,7 @@ def unpicklable(name: str, value: object, error: Exception, pickler: Pickler) ->
 def _culprit(
     text: str, value: object, error: Exception, pickler: Pickler, seen: set[int]
 ) -> tuple[str, object, Exception]:
-    """The innermost value that fails, how to call it, and how it does."""
+    """The path to the innermost value that cannot be pickled, the value, and its error."""
     for step, child in _members(value):
         if id(child) in seen or len(seen) > _ATTEMPTS:
             continue
@@ -185,7 +185,7 @@ def _culprit(
 
 
 def _members(value: object) -> Iterator[tuple[str, object]]:
-    """What a value consists of, and how one gets at it."""
+    """The elements and attributes of a value, each after the text of the step to it."""
     for step, child in _children(value) or ():
         yield f"[{_step_text(step)}]", child
     attributes = getattr(value, "__dict__", None)

@@ -122,7 +122,7 @@ def check_document(document: bytes, limits: WireLimits) -> None:
 
 
 def _looks_flat(document: bytes, limits: WireLimits) -> bool:
-    """Says cheaply that a document is harmless; it may say no to harmless ones."""
+    """A cheap check that a document is within all limits; it may reject one that is."""
     if len(document) > min(_SMALL_BYTES, limits.items, limits.text_bytes):
         return False
     openers = len(document) - len(document.translate(None, _OPENERS))

@@ -210,7 +210,7 @@ def _typed(fields: Mapping[str, Any], name: str, kind: type) -> Any:
 
 
 def _attributes(value: object) -> tuple[str, ...]:
-    """Names that no attribute of a worker may have are left out: honest classes have them too."""
+    """The names, without those that are never served: honest classes have such names too."""
     if type(value) is not tuple or len(value) > MAX_NAMES:
         raise RemoteProtocolError(f"attributes is not a tuple of at most {MAX_NAMES} names")
     return tuple(filter(is_servable, [checked_name(item, "attributes") for item in value]))
@@ -240,7 +240,7 @@ def read_metadata_facts(value: object) -> dict[str, Any]:
 
 
 def _count(value: object, left: int) -> int:
-    """How many values may follow. It is no deeper than messages are."""
+    """How many more values metadata may hold. The depth is bounded by that of a message."""
     left -= 1
     if isinstance(value, np.ndarray):
         left -= value.size

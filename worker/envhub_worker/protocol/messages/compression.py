@@ -39,7 +39,7 @@ def pack_frames(frames: Sequence[Buffer], compression: str) -> list[Buffer]:
 
 
 def _packed(frame: Buffer, block: Any) -> bytes | None:
-    """The frame compressed, or None where that does not pay."""
+    """The compressed frame, or None if compression saves too little."""
     if _size(frame) < SMALLEST:
         return None
     view = memoryview(frame).cast("B")

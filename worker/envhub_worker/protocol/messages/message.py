@@ -150,7 +150,7 @@ def pack(
 def _handed(
     message: Message, values: list[Any], pickler: Pickler, limits: WireLimits
 ) -> list[object]:
-    """The fields as they are sent."""
+    """The fields as they are sent: the caller's own objects in them are pickled."""
     from envhub_worker.protocol.codec.unsendable import handed_over, unpicklable
 
     sent = list(values)
@@ -166,7 +166,7 @@ def _handed(
 
 
 def _asked(message: Message) -> str:
-    """What the caller asked for, to stand before an error about it."""
+    """The caller's call, as a prefix for an error about its arguments."""
     if not message.ASKS:
         return ""
     name = getattr(message, "name", None)
@@ -204,7 +204,7 @@ def unpack(
 
 
 def _alone(frames: Sequence[Buffer]) -> bytes:
-    """The header, where that is all there is and small: what recurs; else nothing."""
+    """A small header without other frames: such messages recur. Empty for others."""
     if len(frames) != 1:
         return b""
     header = frames[0] if type(frames[0]) is bytes else memoryview(frames[0]).cast("B")

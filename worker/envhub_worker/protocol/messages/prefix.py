@@ -83,7 +83,7 @@ class Prefix(Generic[T]):
             return list(map(self._check, self._things(frames[0]))), frames[1:]
 
     def _things(self, frame: Buffer) -> tuple[object, ...]:
-        """Bounded before it is decoded."""
+        """The items of a frame, whose size is checked before it is decoded."""
         size, name = memoryview(frame).nbytes, self._kind.__name__
         if size > self._max_bytes:
             text = f"{size} bytes of {name} are over the limit of {self._max_bytes}."

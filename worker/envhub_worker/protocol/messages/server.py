@@ -106,7 +106,7 @@ class OpenJail(Message, kind=4):
         return read_hub_copies(self.hub_copies)
 
     def with_trees(self, trees: Mapping[str, str]) -> tuple[object, ...]:
-        """``hub_copies`` with other paths for these."""
+        """``hub_copies`` with these paths in place of the names of trees."""
         repositories = self.repositories
         return tuple((*copy[:3], trees.get(copy.tree, copy.tree)) for copy in repositories)
 

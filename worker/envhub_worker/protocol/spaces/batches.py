@@ -60,7 +60,7 @@ def is_batch(batched: gym.Space[Any], single: gym.Space[Any], count: int) -> boo
 
 
 def _mapped(leaf: Callable[..., Any], space: gym.Space[Any], *values: Any) -> Any:
-    """Mappings and tuples like those of the space, with ``leaf(space, *parts)`` of all else."""
+    """Rebuild the nesting of ``space`` with ``leaf(space, *parts)`` for each space in it."""
     if isinstance(space, spaces.Dict):
         items = space.spaces.items()
         return {key: _mapped(leaf, sub, *(value[key] for value in values)) for key, sub in items}
@@ -249,7 +249,7 @@ class _Room:
 
 
 def _bytes(*parts: dict[Any, Any]) -> int:
-    """Of the arrays in infos."""
+    """Total size of the arrays in infos."""
     values = [value for part in parts for value in part.values()]
     nested = _bytes(*(value for value in values if isinstance(value, dict))) if values else 0
     return nested + sum(value.nbytes for value in values if isinstance(value, np.ndarray))
@@ -336,7 +336,7 @@ def _is_like(column: Any, value: Any) -> bool:
 
 
 def _members(infos: dict[Any, Any], key: Any, count: int) -> Any:
-    """What each sub-environment has of an entry: object ``(count,)``, None where it has nothing."""
+    """The value of an entry for each sub-environment: object ``(count,)``, None without one."""
     value: Any = infos.get(key)
     members = np.full(count, None, dtype=object)
     if value is None:
@@ -359,7 +359,7 @@ def _is_mask(name: Any, infos: dict[Any, Any]) -> bool:
 
 
 def _has(infos: dict[Any, Any], key: Any, index: int) -> bool:
-    """Whether a sub-environment gave it. Trust: what stands for a mask may be anything."""
+    """Whether a sub-environment set the entry. Trust: the value in the mask's place may be any."""
     mask: Any = infos.get(f"_{key}")
     is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.ndim == 1
     return not is_mask or bool(mask[index])

@@ -98,7 +98,7 @@ class SpaceReader:
             raise RemoteProtocolError(text) from error
 
     def _start(self, space: Space, states: object, generator: GeneratorMaker) -> None:
-        """Have a space and its parts draw what those of the worker would."""
+        """Give a space and its parts generators in the state of the worker's."""
         parts = list(seeded_nodes(space))
         if type(states) is not list or len(states) != len(parts):
             raise RemoteProtocolError("A space does not have one generator for each part.")
@@ -222,7 +222,7 @@ def _read_box(
 
 
 def _box_key(name: object, shape: object, *arrays: object) -> tuple[object, ...] | None:
-    """All that a Box is made of, if that is little; None for others, and for what is no Box."""
+    """A cache key of all that a Box is made of; None if that is large or malformed."""
     key: list[object] = [name]
     if not is_shape(shape):
         return None

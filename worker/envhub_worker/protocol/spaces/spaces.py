@@ -184,7 +184,7 @@ def entropy_of(bits: Any) -> Any:
 
 
 def _state(space: Space) -> Any:
-    """The state of its generator; None if there is none, or it starts anywhere."""
+    """The state of a space's generator; None if it has none, or one that was seeded at random."""
     generator = getattr(space, "_np_random", None)
     if type(generator) is not np.random.Generator:
         return None

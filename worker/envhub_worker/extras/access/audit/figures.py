@@ -171,7 +171,7 @@ class Usage:
 
 
 def _members(jails: Mapping[int, str]) -> Iterator[tuple[Process, str]]:
-    """All processes of the jails: each one's first, and what it has below it."""
+    """All processes of the jails: the first of each, and its descendants."""
     children = procfs.all_children() if jails else {}
     for first, client in jails.items():
         for pid in (first, *procfs.descendants(first, children=children)):
@@ -193,7 +193,7 @@ def look_at(pid: int) -> Process | None:
 
 
 def _share(pid: int, resident: int) -> int:
-    """What a process would give back: pages that it shares count in part."""
+    """Proportional memory of a process: a shared page is divided among its owners."""
     with contextlib.suppress(OSError):
         return procfs.numbers(f"/proc/{pid}/smaps_rollup").get(b"Pss", resident)
     return resident

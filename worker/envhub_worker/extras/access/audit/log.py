@@ -70,7 +70,7 @@ def _time(when: float) -> str:
 
 
 def _bounded(name: str, value: object) -> bool | int | float | str:
-    """A number, or text that is not too long."""
+    """A number as it is, floats rounded; else text, cut to its limit."""
     if isinstance(value, float):
         return round(value, 3)
     if isinstance(value, (bool, int)):
@@ -263,7 +263,7 @@ def _jail(entry: JailRecord) -> dict[str, object]:
 
 
 def _how(death: m.Death) -> dict[str, object]:
-    """Trust: the detail may quote a jail."""
+    """How a jail died. Trust: the detail may quote the jail."""
     fields = {
         "reason": death.reason,
         "signal": death.signal,
@@ -274,6 +274,6 @@ def _how(death: m.Death) -> dict[str, object]:
 
 
 def _use(entry: JailRecord) -> dict[str, object]:
-    """Over the server; what goes through shared memory is not counted."""
+    """How long a jail lived, and its bytes over the server: shared memory is not counted."""
     sent, received = entry.bytes_moved()
     return {"seconds": monotonic() - entry.since, "bytes_in": sent, "bytes_out": received}

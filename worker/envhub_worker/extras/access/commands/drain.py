@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _server(chosen: Path | None) -> tuple[int, bool]:
-    """A pidfd of the server that listens, and whether it drains. It is asked over its key."""
+    """A pidfd of the server that listens, and whether it drains. Its key proves its answers."""
     address = status.address_here(chosen)
     if address[1] is None:
         raise status.UnreachableError(
@@ -53,7 +53,8 @@ def _server(chosen: Path | None) -> tuple[int, bool]:
         )
     pidfd = os.pidfd_open(facts["pid"])
     try:
-        # a number may be given out anew; who says again that it is his has had it meanwhile
+        # The pid may have been reused before we opened it. If the server names the same pid again,
+        # it has had it all the time.
         if status.of_server(*address)["pid"] != facts["pid"]:
             raise status.UnreachableError("the server has just been replaced: try again")
     except BaseException:

@@ -145,8 +145,8 @@ def _announce(
 
 @contextmanager
 def _watched(metrics: str | None, log: Log, *, usable: bool) -> Iterator[Publish | None]:
-    """The port for monitoring, if one is wanted: gives what is to be called with figures.
-    Raises ``UsageError``: it cannot be had; the text says why.
+    """Open the port for monitoring, if one is wanted; yields the function that takes figures.
+    Raises ``UsageError``: it cannot be opened; the text says why.
     """
     if metrics is None:
         yield None

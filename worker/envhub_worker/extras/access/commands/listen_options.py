@@ -188,9 +188,9 @@ _count, _seconds = partial(_at_least, 1), partial(_at_least, 0)
 
 
 def _weakest_profile() -> str:
-    """In a container the container is the outer layer, and the others are often not to be had.
+    """``container`` in a container, which is a layer itself and often forbids the others.
 
-    But a jail of that profile is our user: without Landlock it would read our keys and all stores.
+    A jail of that profile runs as our user: without Landlock it would read our keys and stores.
     """
     contained = any(map(os.path.exists, _CONTAINER_MARKS)) and landlock.version() >= 1
     return "container" if contained else "strict"

@@ -71,9 +71,9 @@ def _make_private(folder: Path) -> None:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Whether no other user can have put it there: the temporary folder is for all.
+    """Whether the folder is ours and only we can write it: others can put one in ``/tmp``.
 
-    One that we own and cannot write is a read-only container's, and no server's.
+    A folder of ours that we cannot write is a read-only container's, and no server uses it.
     """
     status = folder.lstat()
     ours = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid()

@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _address(arguments: argparse.Namespace) -> tuple[str, bytes | None, keys.KeyPair]:
-    """The endpoint, the server's public key, and the pair to be known by."""
+    """The endpoint, the server's public key, and our own key pair."""
     if arguments.endpoint:
         if not arguments.server_key or not arguments.key:
             raise ValueError("--endpoint needs --server-key and --key")

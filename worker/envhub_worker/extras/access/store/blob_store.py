@@ -199,9 +199,9 @@ class SharedUse:
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[bool]:
-        """Whether no other server uses the folder, nor begins to in this context.
+        """A context that says whether no other server uses the folder, and keeps it so.
 
-        Where the file system has no locks, it is never known, and so False.
+        False on a file system without locks.
         """
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)

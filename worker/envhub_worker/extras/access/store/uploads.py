@@ -214,7 +214,7 @@ class Uploads:
         return self._charged(self._store(key))
 
     def _alone(self) -> contextlib.AbstractContextManager[bool]:
-        """Whether no other server uses the folder, nor begins to in this context."""
+        """A context that says whether no other server uses the folder, and keeps it so."""
         return contextlib.nullcontext(True) if self._use is None else self._use.alone()
 
     def _store(self, key: bytes) -> BlobStore:
