@@ -65,7 +65,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def probe() -> dict[str, Any]:
-    """All of it. This process must be single-threaded."""
+    """Everything that this host can enforce. This process must be single-threaded."""
     restricted = procfs.text("/proc/sys/kernel/apparmor_restrict_unprivileged_userns") == "1"
     return {
         "host": host_facts(),
@@ -75,7 +75,7 @@ def probe() -> dict[str, Any]:
 
 
 def host_facts() -> dict[str, Any]:
-    """Kernel, machine, user and what hangs on them."""
+    """Kernel, machine and user, with what depends on them."""
     name = os.uname()
     hierarchy = cgroups.discover()
     return {
@@ -95,7 +95,7 @@ def apparmor_profile() -> str:
 
 
 def try_layer(name: str, attempt: Callable[[], str]) -> dict[str, Any]:
-    """Whether ``attempt`` goes through in a child; it returns what it found."""
+    """Run ``attempt`` in a child process, and return its result or why it failed."""
     read, write = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -242,7 +242,7 @@ def announcement(surroundings: Surroundings, **more: str) -> str:
 
 
 def own_runtime() -> Runtime:
-    """What jails run on where nothing else is said: in a derived image its environment."""
+    """The default runtime of jails: in a derived image its environment."""
     return Runtime(str(ENVIRONMENT)) if ENVIRONMENT.exists() else OWN
 
 

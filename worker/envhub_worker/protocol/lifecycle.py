@@ -89,7 +89,7 @@ class Lifecycle:
 
     @property
     def closed(self) -> bool:
-        """Whether it is over."""
+        """Whether the environment is closed."""
         return self.state is State.CLOSED
 
     def answered(self) -> None:

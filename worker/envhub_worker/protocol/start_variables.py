@@ -53,7 +53,7 @@ def _values_of(name: str) -> re.Pattern[str] | None:
 
 
 def why_not(name: str, value: str = "") -> str:
-    """Why a jail cannot have this variable with this value; nothing, if it can."""
+    """Why a jail cannot have this variable with this value; empty if it can."""
     values = _values_of(name)
     if values is None:
         if not _REFUSED.fullmatch(name):

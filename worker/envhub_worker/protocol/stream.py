@@ -125,7 +125,7 @@ class StreamReader:
 
     @property
     def chunk(self) -> int:
-        """How many bytes to ask for next: memory for many is dear, and most packets are small."""
+        """How many bytes to ask for next: few at first, as most packets are small."""
         missing = 0 if self._body is None else self._body.nbytes - self._filled
         return min(max(missing, _SMALL_CHUNK), _LARGE_CHUNK)
 

@@ -8,7 +8,7 @@ import sys
 
 _KEPT = "\n\t"
 MARGIN = "  | "
-"""Before a stranger's lines among ours."""
+"""Begins each line of a stranger's text among ours."""
 
 
 def printable(text: str, limit: int = 16_384) -> str:
@@ -60,7 +60,7 @@ def duration_text(seconds: float) -> str:
 
 _SIZE = r"(?a)(\d+(?:\.\d+)?) *([kmgt]?)(i?b|bytes?)?"
 _LEAST_BARE = 2**20
-"""Bytes: who writes fewer without a unit has left it out."""
+"""Least bytes without a unit: for a smaller number the unit was probably forgotten."""
 SIZES = "a size such as 512M, 1.5GiB or 4G; units are powers of 1024"
 """What ``parse_size`` takes, for errors and help."""
 

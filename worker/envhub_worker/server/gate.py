@@ -36,7 +36,7 @@ class Incoming(NamedTuple):
 
 Payload = Sequence[bytes]
 Handler = Callable[[Asker, Any, Payload], m.Message]
-"""Carries a request out that is permitted; returns the reply."""
+"""Carries out a permitted request and returns the reply."""
 
 
 class Gate:
@@ -61,7 +61,7 @@ class Gate:
         self.sessions, self.jails = sessions, jails
 
     def receive(self, router: zmq.Socket[bytes]) -> Incoming:
-        """A message that is there."""
+        """Receive the next message."""
         raise NotImplementedError
 
     def greet(self, arrived: Incoming, name: bytes) -> None:

@@ -90,7 +90,7 @@ class Sessions:
             session.connections.pop(connection, None)
 
     def disconnect(self, wires: Collection[int]) -> None:
-        """Forget the connections that are not among these."""
+        """Forget all connections except these."""
         for session in self._sessions.values():
             for name, connection in list(session.connections.items()):
                 if connection.wire is not None and connection.wire not in wires:
@@ -114,7 +114,7 @@ class Sessions:
         return "" if session is None else session.connections[identity, key].compression
 
     def idle(self, idle_s: float) -> list[Session]:
-        """Sessions that have not been heard from for so long."""
+        """Sessions that were silent for so long."""
         now = self._clock()
         return [session for session in self._sessions.values() if now - session.heard > idle_s]
 

@@ -103,7 +103,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def preload(target: str) -> None:
-    """Import what every runner needs, the code that serves it included: ours, and inert."""
+    """Import what every runner needs: our own code and libraries, nothing of a repository."""
     module, _, _ = target.partition(":")
     import_all([*_PRELOAD, *([] if module.endswith(".py") else [module])])
 
@@ -115,7 +115,7 @@ def import_all(modules: Iterable[str]) -> None:
 
 
 def refuse(channel: Channel, error: LayerUnavailableError) -> None:
-    """Answer every request, on the init's own channel, with what this host cannot enforce."""
+    """Answer every request for a jail with the layer that this host cannot enforce."""
     while received := channel.receive():
         message, (control, output) = received
         jail_init = Channel(socket.socket(fileno=control))

@@ -70,7 +70,7 @@ class FdStore:
             close_fds(fds)
 
     def put(self, jail: int, runner: int, fds: list[int]) -> None:
-        """Keep descriptors for a runner, in the place of those that are there; takes them over."""
+        """Keep descriptors for a runner in place of earlier ones; they are ours from now on."""
         close_fds(self._waiting.pop((jail, runner), []))
         self._waiting[jail, runner] = fds
 
@@ -79,7 +79,7 @@ class FdStore:
         return self._waiting.pop((jail, runner), [])
 
     def drop(self, jail: int) -> None:
-        """Close what waits for a jail that has ended."""
+        """Close the descriptors of a jail that has ended."""
         for key in [key for key in self._waiting if key[0] == jail]:
             close_fds(self._waiting.pop(key))
 

@@ -112,7 +112,7 @@ class JailEvents:
         self.gather(pending)
 
     def follow_writes(self, link: RunnerLink) -> None:
-        """Send the rest when its socket takes it, if there is a rest."""
+        """Watch a runner's socket for writing while something is unsent."""
         if link.wants_write != link.watched:
             link.watched = link.wants_write
             self._loop.watch_writes(link.fileno(), link.watched)
@@ -152,7 +152,7 @@ class JailEvents:
             entry.output.close()
 
     def catch_up(self, entry: JailRecord) -> None:
-        """Hear now what a jail has said, as its loop would in a moment."""
+        """Handle a jail's events now, as the loop would in a moment."""
         if entry.death is None and entry.jail.fileno() >= 0:
             self._jail_events(entry)
 
@@ -249,7 +249,7 @@ class JailEvents:
         self._witness.lost(entry, death)
 
     def end(self, entry: JailRecord, death: m.Death) -> None:
-        """Write the jail's death down, tell everybody who waits, and make it true."""
+        """Record the jail's death, answer everybody who waits, and kill its processes."""
         if entry.death is not None:
             return
         self.deaths[death.reason] += 1

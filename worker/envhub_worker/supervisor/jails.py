@@ -232,7 +232,7 @@ class Jails:
             self._events.gather(pending)
 
     def share(self, asker: Asker, request: m.ShareSlabs) -> m.Message:
-        """Make slabs for runners; each takes its own along with its ``Attach``."""
+        """Make slabs for runners; each gets its own with its ``Attach``."""
         entry = self._owned(asker, request.jail)
         most = self._wire_limits(entry).message_bytes
         room = entry.jail.spec.confinement.limits.memory_bytes
@@ -265,7 +265,7 @@ class Jails:
         return m.Done()
 
     def expire(self, asker: Asker, request: m.ExpireIdle) -> m.Message:
-        """End it once it has done nothing for so long."""
+        """Set after how long without a request a jail ends."""
         entry = self._owned(asker, request.jail)
         entry.idle = entry.idle or IdleTimer(request.idle_ms / 1000)
         return m.Done()

@@ -46,14 +46,14 @@ class RunnerLink:
 
     @property
     def owed(self) -> list[Any]:
-        """The owners of all that it owes, the oldest first; of a step, the last."""
+        """The owners of unanswered requests, the oldest first, and that of a step last."""
         owners = list(self.pending.values())
         if self.slabs is not None and self.slabs.owner is not None:
             owners.append(self.slabs.owner)
         return owners
 
     def owe_nothing(self) -> None:
-        """Nobody waits for it any more."""
+        """Drop all requests that the runner has not answered."""
         self.pending.clear()
         if self.slabs is not None:
             self.slabs.owner = None

@@ -41,12 +41,12 @@ _CHUNK_BYTES = 1 << 19
 """One frame of a large observation: while one is encrypted, the one before it is decrypted."""
 _MAX_SPIN_NS = 400_000
 _TURN_NS = 20_000
-"""For how long the server looks at nothing but slabs."""
+"""How long the server polls the slabs before it does anything else."""
 _RECHECK_MS = 2
 _MAY_SPIN = os.uname().machine == "x86_64" and len(os.sched_getaffinity(0)) > 1
 """Elsewhere a core may see the sequence word before the data it announces; one core is not two."""
 _MAX_VAIN = 16
-"""Rings of a runner, one after the other, that announce nothing."""
+"""Most rings of a runner in a row without an answer."""
 
 
 class ServedSlabs:
@@ -107,7 +107,7 @@ class ServedSlabs:
             self._runner_bell.ring()
 
     def park(self) -> None:
-        """From here on our doorbell has to be rung."""
+        """Ask the runner to ring our doorbell: nobody polls from now on."""
         self.awake_until = 0
         self._asks[words.PARKED] = 1
 
@@ -157,12 +157,12 @@ class ServedSteps:
         return self._epoll.fileno()
 
     def add(self, slabs: ServedSlabs) -> None:
-        """Hear its rings."""
+        """Watch a runner's doorbell."""
         self._by_bell[slabs.bell.fileno()] = slabs
         self._epoll.register(slabs.bell, select.EPOLLIN | select.EPOLLET)
 
     def forget(self, slabs: ServedSlabs) -> None:
-        """Hear it no more, and close it: the jail has a copy of the bell, and may go on ringing."""
+        """Stop watching its doorbell and close it: the jail has a copy and may go on ringing."""
         self._owed.pop(slabs, None)
         self._deafen(slabs)
         slabs.close()
@@ -172,11 +172,11 @@ class ServedSteps:
             self._epoll.unregister(slabs.bell)
 
     def owe(self, slabs: ServedSlabs, take: Callable[[], None]) -> None:
-        """It was asked a step; ``take`` is called once when the answer is there."""
+        """Wait for the answer to a step; ``take`` is called once it is there."""
         self._owed[slabs] = take
 
     def rung(self) -> None:
-        """Take the rings. A runner that only rings is heard no more: each would wake the server."""
+        """Take the rings, and stop watching runners that only ring: each ring wakes the server."""
         for fd, _ in self._epoll.poll(0):
             slabs = self._by_bell.get(fd)
             if slabs is not None:
@@ -206,5 +206,5 @@ class ServedSteps:
         return wait_ms
 
     def close(self) -> None:
-        """Stop hearing."""
+        """Stop watching."""
         self._epoll.close()

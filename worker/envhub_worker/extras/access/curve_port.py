@@ -212,7 +212,7 @@ class ConnectionLimiter:
         self._log.say("connections_full", connections=self._open, why="no more for the moment")
 
     def tick(self) -> None:
-        """Let others in once there is room."""
+        """Accept connections again once there is room."""
         if self._shut_listener is not None and self._open < self._limit:
             with contextlib.suppress(OSError):  # there is no filter any more
                 self._shut_listener.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)

@@ -36,21 +36,21 @@ PROGRAM = "envhub_sandbox.extras.packages.for_a_server"
 MAX_REQUIREMENTS = 1000
 MAX_TEXT = 2000
 MAX_WAITING = 2
-"""Orders of one key that wait or are at work."""
+"""Most unfinished orders of one key."""
 MAX_IN_LINE = 64
-"""Of all keys."""
+"""Most unfinished orders of all keys."""
 MAX_AT_WORK = 4
-"""Programs at once; of one key there is one."""
+"""Most programs at once; one key has one at a time."""
 MAKE_S = 1800.0
-"""For so long one may be at work."""
+"""Most seconds that one program may run."""
 MAX_PER_HOUR = 60
-"""Of one key: each asks the index."""
+"""Most programs of one key in an hour: each asks the package index."""
 _REMEMBERED = 512
 _HOUR_S = 3600.0
 _FORGOTTEN_S = 60.0
-"""An order that was not asked for in so long is given up."""
+"""An order is given up after so long without a request for it."""
 _FAILED_S = 30.0
-"""For so long an order that failed is not tried again."""
+"""How long a failed order is not tried again."""
 _HANDED_S = 600.0
 _RETRY_S = 10.0
 _STOP_S = 30.0
@@ -109,7 +109,7 @@ class PackageProgram:
         self.ended_at = now
 
     def kill(self, patience_s: float = 0.0) -> None:
-        """End it for certain, and what it started; give it so long to end by itself."""
+        """Give it so long to end, then kill it and what it started."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(patience_s)
         with contextlib.suppress(ProcessLookupError):
@@ -117,7 +117,7 @@ class PackageProgram:
         self._process.wait()
 
     def close(self) -> None:
-        """It has ended: forget its output."""
+        """Close its output, after it has ended."""
         self._output.close()
 
 
@@ -140,12 +140,12 @@ class Order:
 
 
 def command() -> list[str]:
-    """The program, in the interpreter that this one runs in."""
+    """The command line of the program, with our own interpreter."""
     return [sys.executable, "-I", "-m", PROGRAM]
 
 
 def why_impossible() -> str:
-    """What hinders the program here; empty for nothing."""
+    """Why the program cannot run here; empty if it can."""
     try:
         done = subprocess.run(
             [*command(), "check"], stdin=subprocess.DEVNULL, capture_output=True, timeout=_CHECK_S
@@ -229,7 +229,7 @@ class Packages:
         return SHARED if self._shared else key.hex()[:32] or "local"
 
     def look(self, in_use: Collection[str]) -> None:
-        """Take what is done, give up what is not asked for, and begin the next."""
+        """Take results, give up orders that nobody asks for, and start the next programs."""
         now = monotonic()
         for order_id, order in list(self._orders.items()):
             if order.program is not None:
@@ -242,7 +242,7 @@ class Packages:
                 self._begin(order_id, in_use)
 
     def news(self) -> list[News]:
-        """What became of orders since this was asked last."""
+        """The orders that have ended since the last call."""
         news, self._news = self._news, []
         return news
 

@@ -49,7 +49,7 @@ class Line:
 
     @property
     def waiting(self) -> int:
-        """How many mean to wait: they have asked more than once, and not long ago."""
+        """How many clients wait: they have asked more than once, and lately."""
         now = self._clock()
         return sum(
             client.times > 1 and now - client.asked <= _PATIENCE_S
@@ -186,7 +186,7 @@ class Places:
     # --- ends ----------------------------------------------------------------------------------
 
     def tick(self) -> None:
-        """End the jails of clients that are not heard from, and what clients no longer hold."""
+        """End the jails of silent clients, and jails that their clients no longer hold."""
         self.end_deserted()
         # First: a client that times out in the loop below would otherwise be logged as having
         # released its jails.
@@ -253,11 +253,11 @@ class Drain:
 
     @property
     def left_s(self) -> float | None:
-        """How long what runs may go on; None before it begins."""
+        """Seconds that open jails have left; None before the drain begins."""
         return None if self._until is None else max(0.0, self._until - self._clock())
 
     def begin(self, log: Log) -> bool:
-        """Let nothing new in; False if there is no time to give, or it was said before."""
+        """Begin to drain; False if open jails get no time, or the drain had begun."""
         if not self._drain_s or self._until is not None:
             return False
         self._until = self._clock() + self._drain_s
@@ -265,7 +265,7 @@ class Drain:
         return True
 
     def quiet(self, busy: bool) -> bool:
-        """Whether no jail has been open for a moment; ``busy``: one is."""
+        """Whether the last jail ended a moment ago or earlier; ``busy``: one is open."""
         now = self._clock()
         if busy or self._quiet_since is None:
             self._quiet_since = None if busy else now
@@ -273,7 +273,7 @@ class Drain:
         return now - self._quiet_since >= _QUIET_S
 
     def refuse_new(self) -> None:
-        """Raise ``BusyError`` once it has begun."""
+        """Raise ``BusyError`` once the drain has begun."""
         if self._until is not None:
             raise BusyError(
                 Busy(DRAINING, 0, 0, RETRY_S),

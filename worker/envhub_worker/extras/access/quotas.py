@@ -163,7 +163,7 @@ class InFlight:
     _requests: dict[tuple[bytes, int], tuple[Asker, bytes, int]] = field(default_factory=dict)
 
     def of(self, key: bytes) -> int:
-        """How many there are of a key."""
+        """Bytes in flight of a key."""
         return self._of[key]
 
     def add(self, key: bytes, asker: Asker, size: int, quota: int) -> None:

@@ -78,7 +78,7 @@ class RemoteGate(Gate):
     # --- the socket ----------------------------------------------------------------------------
 
     def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
-        """CURVE, and what bounds a peer that keeps none of the rules."""
+        """Set up CURVE and the bounds on connections."""
         rules = self._rules
         limits = self._log, rules.max_connections
         self._port = CurvePort(router, loop, rules.keys, self._admits, *limits)
@@ -213,7 +213,7 @@ class RemoteGate(Gate):
         return m.Sessions(tuple(self._sessions_of(asker.key)), self.figures(asker.key))
 
     def answered(self, asker: Asker, reply: m.Message) -> None:
-        """Its bytes are no longer in flight; a refusal is counted and written down."""
+        """Take a request's bytes off those in flight; count and log a refusal."""
         self._in_flight.answered(asker)
         if isinstance(reply, m.Refusal):
             self._tally.refused(reply.error, reply.missing)
@@ -272,7 +272,7 @@ class RemoteGate(Gate):
     # --- time ----------------------------------------------------------------------------------
 
     def tick(self) -> None:
-        """End the jails of clients that are not heard from, and what clients no longer hold."""
+        """End the jails of silent clients, and jails that their clients no longer hold."""
         self._log.tick()
         self._port.connections.tick()
         self._read_clients()
@@ -311,7 +311,7 @@ class RemoteGate(Gate):
         return self._drain.begin(self._log)
 
     def drained(self) -> bool:
-        """Whether it may end: no jail is left, and every client had a moment to hear so."""
+        """Whether the server may end: no jail is left, and clients had a moment to hear so."""
         return self._drain.left_s is not None and self._drain.quiet(bool(self.jails.open_ones()))
 
     def close(self) -> None:

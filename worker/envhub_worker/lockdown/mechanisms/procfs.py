@@ -23,7 +23,7 @@ def stat(pid: int) -> list[bytes]:
 
 
 def content(path: str) -> bytes:
-    """A file of ``/proc``; empty when its process has gone."""
+    """The content of a file of ``/proc``; empty when its process has gone."""
     try:
         with open(path, "rb") as file:
             return file.read()
@@ -32,7 +32,7 @@ def content(path: str) -> bytes:
 
 
 def text(path: str) -> str | None:
-    """What a small file says, such as a setting; None where it cannot be read."""
+    """The text of a small file, such as a setting; None if it cannot be read."""
     with contextlib.suppress(OSError), open(path, errors="replace") as file:
         return file.read(4096).strip()
     return None

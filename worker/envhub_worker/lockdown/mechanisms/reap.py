@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator
 from envhub_worker.lockdown.mechanisms.procfs import descendants
 
 PATIENCE_S = 5.0
-"""For those that were killed; what waits in the kernel ends later."""
+"""How long to wait for killed processes; one that waits in the kernel ends later."""
 _PAUSE_S = 0.001
 
 #: The signals that ``child_signals`` sets handlers for.

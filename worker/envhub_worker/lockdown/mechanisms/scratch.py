@@ -27,7 +27,7 @@ class Scratch:
 
     @classmethod
     def in_namespace(cls) -> Scratch:
-        """Where a jail with a mount namespace of its own finds them."""
+        """The folders in a jail with its own mount namespace."""
         return cls(HOME, TEMPORARY, WORK, SHARED_MEMORY)
 
     @classmethod

@@ -20,7 +20,7 @@ _MAX_INSTRUCTIONS = 4096
 
 @dataclass(frozen=True)
 class Label:
-    """The place that branches name."""
+    """A position that branches jump to."""
 
     name: str
 

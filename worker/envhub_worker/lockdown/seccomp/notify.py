@@ -58,7 +58,7 @@ class Request:
 
     @property
     def arguments(self) -> list[int]:
-        """The first three, as the C integers that the kernel reads."""
+        """The first three words, as the C integers that the kernel reads."""
         return [c_int(word) for word in self.words[:3]]
 
 

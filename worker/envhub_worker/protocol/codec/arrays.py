@@ -116,7 +116,7 @@ class ArrayReader:
     def read(
         self, dtype: np.dtype[Any], shape: tuple[int, ...], nbytes: int, own_frame: bool
     ) -> Array:
-        """The same of what ``parse_descriptor`` has made of it."""
+        """As ``take``, for a descriptor that ``parse_descriptor`` has split."""
         if not nbytes:
             return np.empty(shape, dtype)
         array: Array

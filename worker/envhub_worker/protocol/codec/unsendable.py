@@ -34,11 +34,11 @@ _DEPTH = 16
 _FEW = 64
 """Keys that are not text, or elements of a set. Above this the receiver counts their hashes."""
 _MOST_ARRAYS = 1024
-"""Each may become a frame."""
+"""Most arrays in a value: each may become a frame."""
 _ATOMS = frozenset({type(None), bool, float, complex})
 _SCALARS = frozenset(np.dtype(char).type for char in "?bBhHiIlLqQefdFDmM")
 _ARRAYS = frozenset("?bBhHiIlLqQefdFDmMS")
-"""Characters of dtypes whose bytes are all there is to them."""
+"""Characters of dtypes whose values are entirely in their bytes."""
 
 
 def handed_over(value: object, pickler: Pickler, limits: WireLimits) -> object:
@@ -257,7 +257,7 @@ def _step_text(step: object) -> str:
 
 _PLAIN = frozenset({bool, float, type(None)})
 _SHORT = 64
-"""Characters of a text, bits of an integer, that need no trial."""
+"""Texts of so few characters, and integers of so few bits, can always be sent."""
 _AROUND = 2
 """Containers that the message itself and a ``RemoteObject`` in it add to the depth."""
 _SPARE = 64
@@ -288,7 +288,7 @@ class _Walk:
         self._text_left = limits.header_bytes // 2
 
     def value(self, value: Any, depth: int) -> Any:
-        """What is sent of it."""
+        """The value that is sent in its place."""
         kind = type(value)
         self._left -= 1
         if kind in _PLAIN or (kind is int and value.bit_length() < _SHORT):
@@ -308,7 +308,7 @@ class _Walk:
         return self.members(value, depth)
 
     def is_sent(self, value: object) -> bool:
-        """Whether it can be sent as it is. Its error is not asked: that may fail, too."""
+        """Whether it can be sent as it is. The error is not printed: that may fail, too."""
         try:
             self._send(value)
         except Exception:
@@ -316,7 +316,7 @@ class _Walk:
         return True
 
     def members(self, value: Any, depth: int) -> Any:
-        """A container of what is sent of its members."""
+        """The container with each member replaced by ``value``."""
         if isinstance(value, dict):
             pairs = [(self.value(k, depth + 1), self.value(v, depth + 1)) for k, v in value.items()]
             return dict(pairs)

@@ -99,7 +99,7 @@ def checked_key(value: object, role: str) -> str:
 
 
 def optional_name(value: object, role: str) -> str | None:
-    """The same, or None."""
+    """As ``checked_name``, or None."""
     return None if value is None else checked_name(value, role)
 
 

@@ -35,7 +35,7 @@ SHARED_STATE = {
     "environment": "environment variables",
     "directory": "the working directory",
 }
-"""What a process has once, and how the client calls it."""
+"""State that all sub-environments of a process share, and the client's name for it."""
 
 RemoteWarning = tuple[str, str]
 """The category's name, and the text."""
@@ -44,7 +44,7 @@ Attribute = tuple[int, str]
 T = TypeVar("T")
 
 _LENGTH_BYTES = 4
-"""The length of the document."""
+"""Bytes of the field with the length of the document."""
 _LIST = 0x90
 """The head of a short list of msgpack; a message is one of its kind and its fields."""
 
@@ -69,7 +69,7 @@ class Prefix(Generic[T]):
         self._head = bytes([_LIST + 1 + len(kind.FIELDS), kind.kind])
 
     def put(self, things: Sequence[T], frames: Sequence[Buffer]) -> list[Buffer]:
-        """A reply's frames with these things in front of them."""
+        """A reply's frames behind these items."""
         return [*pack(self._kind(tuple(things))), *frames]
 
     def read(self, frames: Sequence[Buffer]) -> tuple[list[T], Sequence[Buffer]]:

@@ -29,7 +29,7 @@ class Welcome(Message, kind=2):
 
 BUSY_ERROR = "ServerBusyError"
 DRAINING = "draining"
-"""In the place of a quota: the server is about to end."""
+"""Stands for a quota's name while the server drains."""
 LONGEST_S = 60.0
 _NUMBERS = r"(\d{1,18}) (\d{1,18}) (\d{1,4}(?:\.\d{1,3})?)"
 _NAME = r"[a-z_]{1,32}"

@@ -160,7 +160,7 @@ APART_REWARD = -2
 
 
 def reward_misfit(reward: Any, index: int, shape: tuple[int, ...] = ()) -> str:
-    """What is wrong with a reward that a vector environment cannot have."""
+    """The text of the error about a reward that no vector environment can have."""
     needed = f"numbers of shape {shape}, as its reward_space says" if shape else "one number each"
     return (
         f"step of sub-environment {index} returned {shown(reward)} as reward. A vector environment "

@@ -124,7 +124,7 @@ class SpaceReader:
         return build(self, *(value[name] for name in names))
 
     def child(self, value: object) -> Space:
-        """What the space that is being read holds."""
+        """A space inside the one that is being read."""
         if self._depth == MAX_SPACE_DEPTH:
             raise RemoteProtocolError(f"Spaces are nested deeper than {MAX_SPACE_DEPTH}.")
         self._depth += 1
@@ -133,7 +133,7 @@ class SpaceReader:
         return space
 
     def children(self, value: object) -> list[Space]:
-        """All that the space that is being read holds."""
+        """All spaces inside the one that is being read."""
         if type(value) is not list or len(value) > MAX_CHILDREN:
             raise RemoteProtocolError("A space's parts are not a list of sane length.")
         return list(map(self.child, value))

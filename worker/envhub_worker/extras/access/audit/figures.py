@@ -25,10 +25,10 @@ from envhub_worker.protocol.text import printable
 from envhub_worker.supervisor.records import JailRecord
 
 MAX_CLIENTS = 256
-"""Names that are kept apart; what comes after them is one."""
+"""Most clients with figures of their own; all further ones share one entry."""
 OTHERS = "(others)"
 OPERATIONS = ("make_env", "reset", "step", "call", "get_attr", "set_attr", "render", "close")
-"""What requests are counted by; a client may call its own anything."""
+"""Operations that are counted by name; a client may send any name."""
 REFUSALS = (
     *("sessions", "jails", "runners", "memory", "inflight", "draining", "packages"),
     *("PolicyError", "SandboxUnavailableError", "SnapshotIntegrityError", "VersionMismatchError"),
@@ -46,7 +46,7 @@ _USER, _SYSTEM, _STARTED, _RESIDENT = 11, 12, 19, 21
 
 @dataclass
 class Tally:
-    """What has happened since the start."""
+    """Counts of events since the start."""
 
     refusals: Counter[str] = field(default_factory=Counter)
     requests: dict[str, Counter[str]] = field(default_factory=dict)
@@ -84,7 +84,7 @@ def facts_for_clients(rules: Rules) -> dict[str, Any]:
 
 
 def facts_for_operators(rules: Rules, state: str) -> dict[str, Any]:
-    """What is the operator's own business; keys and snapshots lie below ``state``."""
+    """Facts that only an operator gets. ``state``: the folder of keys and snapshots."""
     try:
         disk = shutil.disk_usage(state)
         size, free = disk.total, disk.free
@@ -141,7 +141,7 @@ class Usage:
         self._thread = threading.Thread(target=self._watch, name="envhub usage", daemon=True)
 
     def watch(self, jails: Mapping[int, str]) -> None:
-        """From now on look at these: jails' first pids, and whose they are."""
+        """Set the jails to look at: their first pids, and their clients."""
         self._jails = jails
         if jails and self._thread.ident is None:
             self._thread.start()
@@ -234,7 +234,7 @@ class ClientFigures:
         return self.shares.setdefault(name, Client())
 
     def add_past(self, tally: Tally, usage: Usage) -> None:
-        """What they have done, those that have gone included."""
+        """Add what clients have done since the start, also in jails that have ended."""
         for name, requests in tally.requests.items():
             self.of(name).requests = dict(requests)
         for name, opened in tally.opened.items():

@@ -31,9 +31,9 @@ from envhub_worker.server.sessions import WATCHER, Session
 from envhub_worker.supervisor.records import Asker, JailRecord, Witness
 
 LINES = 10
-"""Of an event that no key stands behind."""
+"""Most lines in a period of an event without a client's key."""
 CLIENT_LINES = 600
-"""Of an event of one client."""
+"""Most lines in a period of one client's event."""
 PERIOD_S = 60.0
 LEVELS = ("debug", "info", "warning", "error")
 """The least important first."""
@@ -94,7 +94,7 @@ def _to_stderr(line: str) -> None:
 
 
 class Log:
-    """Writes at most so many lines of an event in ``PERIOD_S`` seconds."""
+    """Writes a limited number of lines of each event in ``PERIOD_S`` seconds."""
 
     def __init__(
         self,
@@ -111,7 +111,7 @@ class Log:
         self._counts: Counter[tuple[str, str]] = Counter()
 
     def say(self, event: str, level: str = "warning", *, whose: str = "", **fields: object) -> None:
-        """Write a line, or count it. ``whose`` is the client's key; empty for a stranger's."""
+        """Write a line, or count it as left out. ``whose``: the client's key, if there is one."""
         if LEVELS.index(level) < self._least:
             return
         self.tick()
@@ -187,7 +187,7 @@ class Events(Witness):
         self._client(owner, "packages", level, seconds=seconds, **fields)
 
     def refused(self, asker: Asker, refused: m.Refusal) -> None:
-        """A request was not done. Who waits in line asks every second: that is said once."""
+        """A request was refused. A client in line asks each second: that is logged once."""
         owner, level = asker.session or asker.key, "warning"
         fields: dict[str, object] = {"error": refused.error, "why": refused.message}
         if busy := refused.busy:
@@ -237,7 +237,7 @@ class Events(Witness):
         self._client(entry.session, "jail_closed", "info", **fields)
 
     def failed(self, error: Exception) -> None:
-        """Our own mistake, with the way to it; what this machine has no more of is none."""
+        """An error of the server itself. No traceback if only this machine ran out of something."""
         short = shortage(error, "here")
         if short:
             self._log.say("out_of_resources", "error", why=short)

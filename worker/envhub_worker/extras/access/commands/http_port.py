@@ -21,7 +21,7 @@ from typing import Any
 MAX_REQUEST_BYTES = 8192
 MAX_CONNECTIONS = 32
 PATIENCE_S = 5.0
-"""From a connection's beginning to its end."""
+"""Most seconds that a connection may last."""
 _PAUSE_S = 0.5
 _PIECE_BYTES = 4096
 _ENDS = (b"\r\n\r\n", b"\n\n")
@@ -72,7 +72,7 @@ class HttpPort(ThreadingTCPServer):
                 self._cut_oldest()
 
     def get_request(self) -> tuple[socket.socket, Any]:
-        """A connection; where no descriptor is left, who knocks goes on knocking."""
+        """Accept a connection. Without a free descriptor it stays in the backlog: wait a moment."""
         try:
             return super().get_request()
         except OSError:
@@ -80,7 +80,7 @@ class HttpPort(ThreadingTCPServer):
             raise
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection in a thread, in the place of the oldest where there are many."""
+        """Serve a connection in a thread; the oldest is dropped if there are too many."""
         with self._lock:
             if len(self._connections) >= MAX_CONNECTIONS:
                 self._cut_oldest()
@@ -100,7 +100,7 @@ class HttpPort(ThreadingTCPServer):
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Who sends too slowly, or has gone, is no error."""
+        """Ignore errors of a connection: its peer is too slow, or has gone."""
 
     def reply(self, asked: bytes) -> bytes:
         """The answer to a whole request."""

@@ -18,7 +18,7 @@ _ANY_HOST = frozenset({"0.0.0.0", "*", "[::]"})
 
 
 class UsageError(Exception):
-    """The arguments ask for what must not be, or cannot."""
+    """The arguments ask for something that is forbidden or impossible."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Identity:
 
 
 def identity_of(arguments: argparse.Namespace, state: Path) -> Identity:
-    """What the arguments say, with keys of the state folder where they name none."""
+    """The identity by the arguments, with the state folder's keys if they name none."""
     if arguments.insecure_loopback:
         if arguments.key or arguments.authorized_clients or arguments.only_client:
             raise UsageError(
@@ -113,7 +113,7 @@ def announcement(endpoint: str, identity: Identity) -> str:
 
 
 def unusable(strongest: str, weakest: str) -> str:
-    """A warning, or nothing: where no jail can have what is permitted at least."""
+    """A warning if this host cannot run a jail of any permitted profile; else empty."""
     if PROFILES.index(strongest) <= PROFILES.index(weakest):
         return ""
     return (

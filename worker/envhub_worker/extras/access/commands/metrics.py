@@ -39,7 +39,7 @@ class MetricsPage:
         self._rendered: tuple[Mapping[str, Any], Reply] | None = None
 
     def publish(self, figures: Mapping[str, Any]) -> None:
-        """Put figures in the place of the last ones; they do not change any more."""
+        """Replace the figures; the caller does not change them afterwards."""
         self._published = self._clock(), {**figures, "ready": self._usable and not _drains(figures)}
 
     def answer(self, path: str) -> Reply:
@@ -166,7 +166,7 @@ def _family(
 
 
 def exposition() -> Callable[[Mapping[str, Any]], tuple[str, bytes]]:
-    """Makes text of figures. Raises ``ImportError``."""
+    """A function that renders figures as text. Raises ``ImportError``."""
     try:
         from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector
         from prometheus_client.exposition import generate_latest

@@ -66,19 +66,19 @@ class BlobStore:
 
     @property
     def trees(self) -> int:
-        """How many there are."""
+        """The number of trees."""
         return len(self._trees)
 
     def blob(self, sha256: bytes) -> Path:
-        """Where a file lies, or would."""
+        """The path of a file, whether or not it is there."""
         return self.home / "blobs" / sha256.hex()
 
     def tree(self, digest: str) -> Path:
-        """Where a snapshot lies, or would."""
+        """The path of a snapshot, whether or not it is there."""
         return self.home / "trees" / digest
 
     def has_all(self, digest: str, files: Collection[ListedFile]) -> bool:
-        """Whether a snapshot lies there, whole."""
+        """Whether a snapshot is there with all of its files."""
         return all(_is_there(self.tree(digest) / file.path, file.size) for file in files)
 
     def set_aside(self, digest: str) -> None:
@@ -114,7 +114,7 @@ class BlobStore:
         self.held -= self._trees.pop(digest)
 
     def remove_unlinked(self, keep: Collection[bytes]) -> None:
-        """Remove the files that no tree has, but for these."""
+        """Remove the files that are in no tree, except these."""
         names = {sha256.hex() for sha256 in keep}
         with contextlib.suppress(FileNotFoundError), os.scandir(self.home / "blobs") as items:
             for item in items:

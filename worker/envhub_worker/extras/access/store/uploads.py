@@ -195,7 +195,7 @@ class Uploads:
             partial.path.unlink(missing_ok=True)
 
     def forget(self, owner: bytes) -> None:
-        """A client has gone: what it had begun is removed."""
+        """Remove the unfinished uploads of a client that has gone."""
         self._offers.pop(owner, None)
         for bringer, sha256 in list(self._partial):
             if bringer == owner:
@@ -304,7 +304,7 @@ def _listed(file: object) -> ListedFile:
 
 
 def wrong_with_path(path: str) -> str:
-    """What forbids a relative path, or nothing."""
+    """Why a relative path is refused; empty if it is not."""
     steps = path.split("/")
     if path.startswith("/"):
         return "has an absolute name"
