@@ -23,7 +23,7 @@ from envhub_sandbox.cli.shared import exits, host
 from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.cli.shared.exits import Exit
 from envhub_sandbox.extras.judge import reports
-from envhub_sandbox.extras.judge.command import findings, static
+from envhub_sandbox.extras.judge.command import findings
 from envhub_sandbox.extras.judge.findings import Finding, Report
 from envhub_sandbox.extras.remote import doctor as doctor_server
 from envhub_sandbox.extras.remote.sandbox import RemoteSandbox
@@ -68,6 +68,10 @@ _REFUSED = [
     ("inspect ./gone", 3, _NO_FOLDER),
     ("inspect ./gone --sarif x", 2, "--sarif means nothing here"),
     ("inspect ./gone --static --render", 2, "No such option"),
+    ("inspect ./gone --static --n-envs 2", 2, "--n-envs means nothing here: with --static nothing"),
+    ("inspect ./gone --static --async", 2, "--async means nothing here"),
+    ("inspect ./gone --static --fail-on never", 2, "it takes error, warning or note"),
+    ("inspect ./gone --fail-on note", 2, "--fail-on means nothing here: it needs --static"),
     ("check ./gone --allow seeding_", 2, "did you mean 'seeding'?"),
 ]
 
@@ -79,15 +83,6 @@ def test_what_cannot_be_done_is_said_in_one_line(words: str, code: int, text: st
     assert (found, text in " ".join(printed.split())) == (code, True), printed
     assert "Traceback" not in printed
     assert os.listdir() == []
-
-
-def test_reading_is_no_running(monkeypatch: pytest.MonkeyPatch) -> None:
-    """``--static`` goes another way, with its own options."""
-    asked = list[Any]()
-    monkeypatch.setattr(static, "inspect_static", lambda ref, **options: asked.append(options))
-    assert said("inspect", "./here", "--static", "--json")[0] == 0
-    assert [one["as_json"] for one in asked] == [True]
-    assert said("inspect", "./here", "--fail-on", "note")[0] == 2
 
 
 def test_an_empty_store_is_listed() -> None:

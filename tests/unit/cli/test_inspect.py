@@ -90,23 +90,6 @@ def test_findings_fail_where_that_is_asked_for(least: str, code: int, tmp_path: 
     assert (result["ruleId"], result["properties"]["fails"]) == ("source-dynamic", code == 1)
 
 
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        (["--static", "--n-envs", "2"], "--n-envs means nothing here: with --static nothing runs"),
-        (["--static", "--sandbox", "process"], "--sandbox means nothing here"),
-        (["--static", "--async"], "--async means nothing here"),
-        (["--fail-on", "note"], "--fail-on means nothing here: it needs --static"),
-        (["--static", "--fail-on", "never"], "it takes error, warning or note"),
-    ],
-)
-def test_options_that_mean_nothing_are_refused(
-    options: list[str], says: str, tmp_path: Path
-) -> None:
-    done = envhub("inspect", tmp_path / "nowhere", *options)
-    assert (done.exit_code, says in " ".join(done.stderr.split())) == (2, True), done.stderr
-
-
 def test_a_repository_paints_and_commands_nothing(tmp_path: Path) -> None:
     """Neither a terminal nor GitHub's runner: not by names, not by texts, not by what differs."""
     quoted = "\n'''\n::error::forged\n##[error]forged\n'''\n"
