@@ -252,6 +252,7 @@ class HubClient:
         except SnapshotError:
             raise
         except Exception as error:
+            # before it becomes the cause of an error of ours, which tracebacks show
             secrets = self._secrets()
             conceal(error, secrets)
             hostile = [link for link in chain(error) if isinstance(link, HostileAnswerError)]

@@ -166,6 +166,8 @@ class LocalFolder:
         Raises ``SnapshotError``: they cannot be read; ``PolicyError``: it is a folder with keys, or
         a home.
         """
+        # Cheap refusals first: a home may hold millions of files. No content is read before the
+        # names have been looked at for keys, so that none is hashed unasked.
         left: list[LeftOut] = []
         if self.entry is None and not allow_secrets and is_home(self.root):
             raise self._secret("is a home directory, or has one in it")

@@ -142,6 +142,8 @@ def fetch(
         return _registered(ref)
     if public:
         token, endpoint = False, without_login(checked_endpoint(endpoint))
+    # The store first, since a pin that is there needs no request; then the hosts, in the order of
+    # the candidates: a model comes before a space of the same name.
     candidates = _candidates(ref, hub_cache_dir, token, endpoint, limits, needs_entry, public)
     try:
         for candidate in candidates if ref.is_pinned else ():
@@ -362,9 +364,12 @@ class _Candidate:
 
     def _bring(self, slot: store.Slot) -> None:
         with self.host.files(self.repo, slot.commit) as source:
+            # The listing is a stranger's text, so it is judged whole before anything is fetched:
+            # sizes and number while its pages come, then names, before any becomes a path here or
+            # in the cache of the Hub's client; and a mistyped entry file costs no download.
             files = listing_within_limits(source.listing, self.limits, slot.title)
             check_listing_names(files, slot.title)
-            store.refuse_clashes(slot, files)  # the Hub's client has a folder of them, too
+            store.refuse_clashes(slot, files)
             self._require_entry(files)
             size = sum(file.size for file in files)
             SNAPSHOT.info("%s: downloading %d files, %d bytes", slot.title, len(files), size)

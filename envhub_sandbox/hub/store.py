@@ -122,6 +122,9 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
     document, entries = _read_record(slot, text)
     statuses = dict(_walk(slot, slot.tree, "")) if os.path.lexists(slot.tree) else {}
     recorded = {entry.path for entry in entries}
+    # Whether files are missing is asked last. It alone raises ``HalfDeletedError``, after which
+    # ``publish`` replaces the snapshot without a word; a file that was added or edited must be
+    # refused, also where somebody has deleted another one beside it.
     if extra := sorted(statuses.keys() - recorded):
         raise _damaged(slot, f"the file {extra[0]!r} is extra")
     changed = [
@@ -248,6 +251,8 @@ def publish(
     says. ``note`` is kept in the record (where the snapshot is from). Nothing stays if it fails.
     """
     refuse_clashes(slot, files)
+    # All is written into a draft, the record last, and one rename makes the snapshot: a process
+    # that is killed before it leaves a draft, which goes after a day, and nothing to be believed.
     try:
         folders.make(slot.folder)
         _refuse_shared_store(slot.folder)
