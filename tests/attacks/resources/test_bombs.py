@@ -29,6 +29,7 @@ from tests.attacks.harness import (
     start_control,
 )
 from tests.attacks.resources.accounts import figure, in_pipes, of_processes, tasks, terminals
+from tests.support.interpreter import profiles
 from tests.support.processes import eventually, most_grown, resident
 from tests.support.turns import LONGEST_S, turn
 
@@ -120,6 +121,21 @@ KINDS: dict[str, str | Callable[[Run], int]] = {
 }
 
 
+WITHOUT_NAMESPACES = {
+    *("heap", "shared", "System V", "semaphores", "messages", "sockets", "sockets in flight"),
+    *("file locks", "empty folders", "attributes of files", "access lists"),
+}
+"""What ``no-userns`` counts or bounds in another way, without namespaces of networks, System V's
+objects and mounts. The rest is in the same account as under ``strict``, where all are tried.
+"""
+BOMBS = [
+    pytest.param(*profile.values, kind, marks=profile.marks)
+    for profile in profiles("strict", "no-userns")
+    for kind in KINDS
+    if profile.values == ("strict",) or kind in WITHOUT_NAMESPACES
+]
+
+
 @pytest.fixture
 def _machine() -> Iterator[None]:
     """The machine's account belongs to one bomb at a time, whichever process tests it."""
@@ -130,7 +146,7 @@ def _machine() -> Iterator[None]:
 @pytest.mark.short("strict-heap")
 @pytest.mark.timeout(LONGEST_S + 300)
 @pytest.mark.usefixtures("_machine")
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("arena", "kind"), BOMBS, indirect=["arena"])
 def test_memory_bomb_stops_at_the_limit(arena: Arena, kind: str) -> None:
     """All memory counts: private, shared, without a name or an owner, of all processes together."""
     no_pipes = "the kernel limits a plain user's pipes by itself"
