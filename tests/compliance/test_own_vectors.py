@@ -461,10 +461,13 @@ def _played(envs: list[Any]) -> list[Any]:
     return heard
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 @pytest.mark.parametrize(
-    ("wide", "copy", "tasks", "restart"),
-    [(3, True, 1, "never"), (20_000, False, 1, "transparent"), (3, False, 2, "never")],
+    ("mode", "wide", "copy", "tasks", "restart"),
+    [
+        ("NextStep", 3, True, 1, "never"),
+        ("SameStep", 20_000, False, 1, "transparent"),
+        ("Disabled", 3, False, 2, "never"),
+    ],
 )
 def test_an_own_vector_is_stepped_in_shared_memory_and_returns_the_same(
     tmp_path: Path,

@@ -8,7 +8,7 @@ from tests.compliance.differential import KINDS, cases, rows, sharing
 from tests.compliance.theirs.through_sandbox import vector
 
 CALLS = 12
-EACH = {"calls": 20, "rows": 12, "sharing": 5}
+EACH = {"calls": 12, "rows": 8, "sharing": 3}
 
 
 @pytest.mark.short("calls")
