@@ -11,26 +11,14 @@ PRINTED = {
     "with_cleanrl.py": "the weights are the same, to the last bit: True",
     "with_cleanrl_async.py": "episodes: the first last",
     "with_sb3.py": "trained for 512 steps",
+    "with_torchrl.py": "a rollout of 40 steps",
 }
-# one after the other in one process, since to import torch takes longer than to run them
-_RUN = """
+# one after the other in one process, since to import torch takes longer than to run them; not in
+# ours, where importing TorchRL would set up warnings and logs for everybody
+_PROGRAM = f"""
 import runpy, sys
 for path in sys.argv[1:]:
     runpy.run_path(path, run_name="__main__")
-"""
-
-
-def test_example_scripts(tmp_path: Path) -> None:
-    """Each ends well and prints what it promises."""
-    for needed in ("torch", "stable_baselines3"):
-        pytest.importorskip(needed)
-    scripts = [EXAMPLES / name for name in PRINTED]
-    done = python("-c", _RUN, *scripts, ENVHUB_CACHE=str(tmp_path / "cache"))
-    assert [printed for printed in PRINTED.values() if printed not in done.stdout] == []
-
-
-# in another process: importing it sets up warnings and logs for everybody
-_TORCHRL = f"""{_RUN}
 import torch
 from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
@@ -55,12 +43,13 @@ if __name__ == "__main__":
 """
 
 
-def test_the_wrapper_of_torchrl() -> None:
-    """The example runs. One environment, and vector environments in the modes that it takes, pass
-    its own check; episodes end."""
-    for needed in ("torch", "torchrl"):
+def test_example_scripts(tmp_path: Path) -> None:
+    """Each ends well and prints what it promises. One environment, and vector environments in the
+    modes that TorchRL takes, pass its own check; episodes end."""
+    for needed in ("torch", "stable_baselines3", "torchrl"):
         pytest.importorskip(needed)
-    done = python("-c", _TORCHRL, EXAMPLES / "with_torchrl.py")
-    assert "a rollout of 40 steps" in done.stdout
+    scripts = [EXAMPLES / name for name in PRINTED]
+    done = python("-c", _PROGRAM, *scripts, ENVHUB_CACHE=str(tmp_path / "cache"))
+    assert [printed for printed in PRINTED.values() if printed not in done.stdout] == []
     said = done.stdout.splitlines()  # it logs there, too
     assert {"one [120]", "SameStep [3, 120]", "Disabled [3, 120]"} <= set(said)
