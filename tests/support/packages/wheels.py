@@ -53,13 +53,17 @@ def make_wheel(
     return path
 
 
+_LEFT_OUT = {"__pycache__", "tests", "f2py", "distutils", "include", "box2d", "mujoco", "toy_text"}
+"""Folders of numpy and Gymnasium that are half of their files, and that no jail of ours imports."""
+
+
 def repacked(folder: Path, name: str) -> Path:
-    """A wheel of what is installed here under this name."""
+    """A wheel of what is installed here under this name, as far as a jail needs it."""
     found = metadata.distribution(name)
     contents = {}
     for file in found.files or ():
         path = Path(str(found.locate_file(file)))
-        if ".." not in file.parts and "__pycache__" not in file.parts and path.is_file():
+        if not {*file.parts} & {"..", *_LEFT_OUT} and path.is_file():
             contents[str(file)] = path.read_bytes()
     info = next(part for part in contents if part.endswith(".dist-info/METADATA")).split("/")[0]
     for extra in ("RECORD", "INSTALLER", "REQUESTED", "direct_url.json"):
