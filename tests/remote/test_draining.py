@@ -153,6 +153,7 @@ class Player(threading.Thread):
         try:
             env.reset(seed=1)
             for count in range(1, 6):
+                self.enough.wait(0.02)  # the servers' starts have the cores; it is in an episode
                 assert env.step(np.array([0]))[0].tolist() == [[float(count)]]
         except WorkerDiedError:
             self.deaths += 1
