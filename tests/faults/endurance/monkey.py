@@ -479,10 +479,16 @@ def run(arguments: argparse.Namespace, name: str) -> dict[str, Any]:
     }
 
 
+def _has_done(monkey: Monkey, least: float, died: bool) -> bool:
+    """Whether it has done as much, and met a death: how soon one shows is up to the machine."""
+    counts = monkey.counts
+    return counts["operations"] >= least and bool(not died or counts["deaths"] * counts["compared"])
+
+
 def _play(monkey: Monkey, arguments: argparse.Namespace, begun: float, part: float) -> None:
     told, end = time.monotonic(), begun + arguments.seconds * part
-    most = arguments.operations * part or float("inf")
-    while (now := time.monotonic()) < end and monkey.counts["operations"] < most:
+    least = arguments.operations * part or float("inf")
+    while (now := time.monotonic()) < end and not _has_done(monkey, least, part == 1):
         faulthandler.dump_traceback_later(_HANG_S, exit=True)
         monkey.once()
         if now > told + arguments.report_s:
@@ -497,7 +503,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Play where the arguments say; 0 if nothing differs and nothing has grown."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--seconds", type=float, default=3600)
-    parser.add_argument("--operations", type=int, default=0, help="at most; 0 is any number")
+    text = "at least, and until a process has died; 0: as long as the seconds last"
+    parser.add_argument("--operations", type=int, default=0, help=text)
     parser.add_argument("--places", nargs="+", choices=PLACES, default=PLACES)
     parser.add_argument("--environments", type=int, default=12, help="at most, at one time")
     parser.add_argument("--kill-every", type=int, default=100, help="operations, about")

@@ -22,7 +22,7 @@ def test_a_difference_would_be_noticed() -> None:
 
 
 def test_a_short_hour(capsys: pytest.CaptureFixture[str]) -> None:
-    code = monkey.main(["--operations", "10", "--kill-every", "2", "--environments", "2"])
+    code = monkey.main(["--operations", "6", "--kill-every", "2", "--environments", "2"])
     found = json.loads(capsys.readouterr().out)
     assert code == 0, found
     for place in monkey.PLACES:
