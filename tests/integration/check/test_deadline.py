@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import re
 import signal
 import subprocess
@@ -19,6 +20,7 @@ from typer.testing import CliRunner
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.extras.judge.command.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.extras.sources import parser
+from envhub_worker.protocol.text import duration_text
 from tests.corpus.entries import Entry
 from tests.hub.stub_hub import StubHub
 from tests.support.command_line import envhub
@@ -179,17 +181,26 @@ def test_a_parser_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.Monkey
     assert eventually(lambda: descendants() <= before)
 
 
+def ring_once_it_hangs() -> None:
+    """Ring the alarm of a check in this process; it listens, as what hangs has it wait."""
+    if eventually(hangs_now):
+        os.kill(os.getpid(), signal.SIGALRM)
+
+
 def test_one_of_a_list_ends_no_other(tmp_path: Path) -> None:
     """What takes too long is not judged to its end, and the next is judged as ever."""
     folder = hanging(tmp_path, "STEP")
     Entry(group="honest").write(tmp_path / "quick")
     (tmp_path / "list").write_text(f"{folder}\n{tmp_path / 'quick'}\n")
-    short = ("--steps", "2", "--resets", "0", "--deadline", "25", "--json")
+    short = ("--steps", "2", "--resets", "0", "--deadline", str(_LONG_S), "--json")
+    alarm = threading.Thread(target=ring_once_it_hangs)
+    alarm.start()
     done = envhub("check", "--all", tmp_path / "list", *short)
+    alarm.join()
     assert done.returncode == 10, done.stderr
     late, quick = json.loads(done.stdout)["results"]
     assert (late["verdict"], quick["verdict"]) == ("not judged", "passed")
-    assert "ended after 25 s, at: " in late["report"]["findings"][0]["message"]
+    assert f"ended after {duration_text(_LONG_S)}, at: " in late["report"]["findings"][0]["message"]
     assert late["report"]["unjudged"]["tasks"]
 
 
