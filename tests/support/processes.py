@@ -5,6 +5,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 
 import psutil
 
@@ -22,6 +23,15 @@ def descendants() -> set[int]:
             with contextlib.suppress(psutil.NoSuchProcess):
                 below.update(one.pid for one in child.children(recursive=True) if _alive(one))
     return below
+
+
+def open_descriptors(path: Path) -> int:
+    """How many descriptors of ours are of a file; those of other threads come and go meanwhile."""
+    links = []
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # the one that is read by, or another thread's
+            links.append(descriptor.readlink())
+    return links.count(path)
 
 
 @contextlib.contextmanager

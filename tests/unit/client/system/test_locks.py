@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.system.locks import LifeLock, SharedLock, held, is_held, lock, sharers
+from tests.support.processes import open_descriptors
 
 SHARE = """
 import sys, time
@@ -66,14 +67,15 @@ def test_the_lock_of_a_file_that_was_replaced_is_none(
 
 
 def test_an_interrupted_wait_leaves_no_descriptor(tmp_path: Path) -> None:
-    path, before = tmp_path / "lock", len(os.listdir("/proc/self/fd"))
+    path = tmp_path / "lock"
     with held(path):
         for _ in range(3):
             with pytest.raises(TimeoutError), held(path):
                 pass
+        assert open_descriptors(path) == 1
     with pytest.raises(OSError, match="No such file"), held(tmp_path / "none" / "lock"):
         pass
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert open_descriptors(path) == 0
 
 
 def test_a_link_is_no_lock(tmp_path: Path) -> None:

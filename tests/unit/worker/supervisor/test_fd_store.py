@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pytest
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.fd_store import FDS, FdStore
+from tests.support.processes import open_descriptors
 
 DEPOSIT = b"".join(m.pack(m.Deposit(b"mine", 1, 1)))
 
@@ -37,14 +37,14 @@ def test_what_is_not_taken_is_closed(
 ) -> None:
     monkeypatch.chdir(tmp_path)  # the path of a socket has 107 bytes at most
     store = FdStore("fds", lambda _: pidfd)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
+    brought = tmp_path / "brought"
+    with brought.open("w") as file, socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
         client.connect("fds")
         if said is not None:
-            socket.send_fds(client, [said], [0] * count)
-        before = len(os.listdir("/proc/self/fd"))
+            socket.send_fds(client, [said], [file.fileno()] * count)
         store.accept()
         kept = FDS if reply == m.TAKEN else 0
-        assert len(os.listdir("/proc/self/fd")) == before + kept
+        assert open_descriptors(brought) == 1 + kept
         answer, given, _, _ = socket.recv_fds(client, 64, 1)
         assert (answer, len(given)) == (reply, int(reply == m.TAKEN))
         assert len(store.take(1, 1)) == kept
