@@ -6,6 +6,7 @@ import contextlib
 import os
 import pwd
 import random
+from operator import itemgetter
 
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import kernel, process, procfs
@@ -54,7 +55,7 @@ def _mapped() -> tuple[int, int]:
     """First and last id of the widest range that this user namespace maps."""
     with open("/proc/self/uid_map") as file:
         ranges = [tuple(map(int, line.split())) for line in file]
-    inside, _, length = max(ranges, key=lambda entry: entry[2])
+    inside, _, length = max(ranges, key=itemgetter(2))
     return inside, inside + length - 1
 
 

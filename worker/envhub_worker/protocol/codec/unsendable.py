@@ -134,8 +134,7 @@ _CHECKS: dict[type, Callable[[_Judge, Any, int], bool]] = {
     range: _Judge.bounds,
     slice: _Judge.bounds,
     np.ndarray: _Judge.array,
-    RemoteObject: lambda judge, value, depth: True,
-    RemoteEnum: lambda judge, value, depth: True,
+    **dict.fromkeys((RemoteObject, RemoteEnum), lambda judge, value, depth: True),
     **dict.fromkeys(_SCALARS, _Judge.scalar),
 }
 

@@ -199,7 +199,7 @@ def unpack(
         decoder = Decoder(tail, buffers, limits, unpickler, tensors, things, borrows=borrows)
         message = _checked(decoder.value(document))
         if len(document) <= MAX_DOCUMENT_BYTES:
-            _INCOMING.met(key, lambda: Incoming(document, tail, buffers, type(message), limits))
+            _INCOMING.met(key, partial(Incoming, document, tail, buffers, type(message), limits))
         return message
 
 
