@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from envhub_sandbox.errors import DependencyError, EnvHubError, RemoteEnvError, WorkerDiedError
@@ -111,9 +111,67 @@ _DISPLAY = (
     r"(connect|open|find)[^\n]{0,20} (X server|[Xx]?[ -]?display)|Qt platform plugin|"
     r"No available video device|Failed to (initialize GLFW|create window)"
 )
-_INPUT = r"EOFError: EOF when reading a line"
 _NO_LIBRARY = r"(unable|fail|can ?not|could not|no such|not found|not available)"
 _OSMESA = rf"(?i)osmesa[^\n]{{0,80}}{_NO_LIBRARY}|{_NO_LIBRARY}[^\n]{{0,80}}osmesa|glGetError"
+_OFFLINE: dict[str, tuple[str, ...]] = {"network": ("none", "loopback")}
+_ADVICE: tuple[tuple[str, dict[str, tuple[str, ...]], str], ...] = (
+    (
+        _HUB,
+        _OFFLINE,
+        "A jail has no network, and of the Hub it has its own repository and its assets only: "
+        "name this one with {assets}",
+    ),
+    (
+        _INSTALL,
+        _OFFLINE,
+        "A jail has no network and cannot install packages: name the packages in the "
+        "repository's requirements.txt, or with {extra}",
+    ),
+    (
+        _NO_FAMILY,
+        {"network": ("none",)},
+        "A jail has no network: for connections between its own processes give it a loopback "
+        "device of its own, with {loopback}",
+    ),
+    (
+        rf"{_DOWNLOAD}|{_NO_FAMILY}",
+        _OFFLINE,
+        "A jail has no network: put what it downloads into the repository, or into one on the "
+        "Hub that {assets} names",
+    ),
+    (
+        r"EOFError: EOF when reading a line",
+        {},
+        "It asked for input, and a jail has no terminal: its author puts the answer into a file "
+        "or a variable that the program reads instead; you give a variable with {variable}",
+    ),
+    (
+        _OSMESA,
+        {},
+        "This machine lacks the library that it draws by: install it (on Debian and Ubuntu: "
+        "apt-get install libosmesa6 for MUJOCO_GL=osmesa, libegl1 for egl), or have it draw by "
+        "EGL, with {egl}",
+    ),
+    (
+        _DISPLAY,
+        {"display": ("none",)},
+        "It tried to open a window, and a jail has no display: have it render to arrays "
+        "(render_mode='rgb_array'), or give the jail a display of its own, with {display}",
+    ),
+    (
+        r"No such file or directory: ['\"][^'\"\n]{0,4096}/packages/",
+        {},
+        "An installed package lacks this file as it was published: no argument brings it, but "
+        "another release may have it",
+    ),
+    (
+        r"No such file or directory: ['\"](?![/~])[^'\"\n]{0,4096}[/.]",
+        {},
+        "A relative path begins in the repository, which lacks this file: put it there. Of a "
+        "package, only a folder of your own with the file and an env.py can have it",
+    ),
+)
+"""What a text says, the values of a policy with which that is no wonder, and what to do."""
 _TEXT_CHARS = 65_536
 
 
@@ -126,48 +184,26 @@ def add_reach_advice(error: EnvHubError, policy: Policy) -> bool:
     if isinstance(remote, RemoteEnvError):
         advice = _advice(f"{remote.type_name}: {remote.message}"[:_TEXT_CHARS], policy)
     elif isinstance(error, WorkerDiedError) and error.signal in ("SIGABRT", "SIGSEGV", None):
-        advice = _of_display(error.log_tail[-_TEXT_CHARS:], policy)
+        advice = _advice(error.log_tail[-_TEXT_CHARS:], policy, (_DISPLAY,))
     if advice and not str(error).endswith(advice):
         error.args = (f"{error.args[0]}\n{advice}", *error.args[1:])
     return bool(advice)
 
 
-def _advice(text: str, policy: Policy) -> str:
-    if policy.network != "host":
-        if re.search(_HUB, text):
-            return (
-                "A jail has no network, and of the Hub it has its own repository and its assets "
-                f"only: name this one with {option_name('assets', ['org/repo@COMMIT'])}"
+def _advice(text: str, policy: Policy, patterns: Collection[str] = ()) -> str:
+    """The sentence of the first row that fits; ``patterns``: of these rows alone."""
+    for pattern, granted, sentence in _ADVICE:
+        applies = all(getattr(policy, name) in values for name, values in granted.items())
+        if applies and pattern in (patterns or (pattern,)) and re.search(pattern, text):
+            return sentence.format(
+                assets=option_name("assets", ["org/repo@COMMIT"]),
+                display=option_name("display", "virtual"),
+                egl=option_name("policy", {"environment": {"MUJOCO_GL": "egl"}}),
+                extra=option_name("dependencies", {"extra": _to_install(text)}),
+                loopback=option_name("network", "loopback"),
+                variable=option_name("policy", {"environment": {"NAME": "VALUE"}}),
             )
-        if re.search(_INSTALL, text):
-            return (
-                "A jail has no network and cannot install packages: name the packages in the "
-                "repository's requirements.txt, or with "
-                f"{option_name('dependencies', {'extra': _to_install(text)})}"
-            )
-        if re.search(_NO_FAMILY, text) and policy.network == "none":
-            return (
-                "A jail has no network: for connections between its own processes give it a "
-                f"loopback device of its own, with {option_name('network', 'loopback')}"
-            )
-        if re.search(_DOWNLOAD, text) or re.search(_NO_FAMILY, text):
-            return (
-                "A jail has no network: put what it downloads into the repository, or into one on "
-                f"the Hub that {option_name('assets', ['org/repo@COMMIT'])} names"
-            )
-    if re.search(_INPUT, text):
-        return (
-            "It asked for input, and a jail has no terminal: its author puts the answer into a "
-            "file or a variable that the program reads instead; you give a variable with "
-            f"{option_name('policy', {'environment': {'NAME': 'VALUE'}})}"
-        )
-    if re.search(_OSMESA, text):
-        return (
-            "This machine lacks the library that it draws by: install it (on Debian and Ubuntu: "
-            "apt-get install libosmesa6 for MUJOCO_GL=osmesa, libegl1 for egl), or have it draw "
-            f"by EGL, with {option_name('policy', {'environment': {'MUJOCO_GL': 'egl'}})}"
-        )
-    return _of_display(text, policy)
+    return ""
 
 
 def _to_install(text: str) -> list[str]:
@@ -177,16 +213,6 @@ def _to_install(text: str) -> list[str]:
         return ["PACKAGE"]
     is_quoted = command["quote"] and command["more"]
     return [command["first"], *(re.findall(_REQUIREMENT, command["more"]) if is_quoted else [])]
-
-
-def _of_display(text: str, policy: Policy) -> str:
-    if not re.search(_DISPLAY, text) or policy.display != "none":
-        return ""
-    return (
-        "It tried to open a window, and a jail has no display: have it render to arrays "
-        "(render_mode='rgb_array'), or give the jail a display of its own, with "
-        f"{option_name('display', 'virtual')}"
-    )
 
 
 # --- files of a local folder that its code does not see ------------------------------------------

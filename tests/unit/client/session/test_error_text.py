@@ -219,6 +219,16 @@ def advised(kind: str, message: str, network: str = "none") -> str:
         ("_tkinter.TclError", "no display name and no $DISPLAY environment variable", "window"),
         ("glfw.GLFWError", "(65550) b'X11: Failed to open display '", "window"),
         ("pygame.error", "No available video device", "window"),
+        (
+            "FileNotFoundError",
+            "[Errno 2] No such file or directory: '/x/packages/gym_x/a.json'",
+            "An installed package lacks this file",
+        ),
+        (
+            "FileNotFoundError",
+            "[Errno 2] No such file or directory: 'data/a.mat'",
+            "in the repository",
+        ),
     ],
 )
 def test_each_failure_names_what_brings_it(kind: str, message: str, named: str) -> None:
@@ -231,6 +241,7 @@ def test_each_failure_names_what_brings_it(kind: str, message: str, named: str) 
     [
         ("ValueError", "pip and git are words, a display too", "none"),
         ("KeyError", "'connect'", "none"),
+        ("FileNotFoundError", "[Errno 2] No such file or directory: 'ffmpeg'", "none"),
         ("socket.gaierror", "[Errno -3] Temporary failure in name resolution", "host"),
         ("ConnectionRefusedError", "[Errno 111] Connection refused", "loopback"),
     ],
