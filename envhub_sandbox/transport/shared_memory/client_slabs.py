@@ -263,7 +263,7 @@ class ShardSlabs:
         slots, self._form = self._answer_slots, None
         area = self._answers if slots is None else slots.bytes_of_chosen()
         if kind == slabs.COLUMNS and slots is not None:
-            return self._step_of_columns(length, slots)
+            return m.StepDone(*self._step_of_columns(length, slots))
         if kind not in (slabs.DONE, slabs.RAISED) or length > len(area):
             raise RemoteProtocolError("the worker wrote an impossible answer into its slab")
         if kind == slabs.RAISED:
@@ -271,7 +271,8 @@ class ShardSlabs:
         self.answer_bytes += length
         with UNTRUSTED:
             frames = read_packet(area[:length], limits)
-        message = unpacked(frames, limits=limits, borrows=_borrows(slots))
+        borrows = slots is not None and slots.chosen != _SPARE
+        message = unpacked(frames, limits=limits, borrows=borrows)
         if slots is not None and type(message) is m.StepDone and self._tells[slabs.OFFERED]:
             self._derive_columns(message, slots.slot_bytes)
         return message
@@ -282,25 +283,28 @@ class ShardSlabs:
             self._form = self._step_columns = StepColumns(m.values_of(message), room)
             self._asks[slabs.DERIVED] = self._asks[slabs.SEQUENCE]
 
-    def _step_of_columns(self, length: int, slots: SlotRing) -> m.Message:
+    def _step_of_columns(self, length: int, slots: SlotRing) -> list[Any]:
         columns = self._step_columns
         if columns is None or length > slabs.INFO_BYTES:
             raise RemoteProtocolError("the worker wrote an impossible answer into its slab")
         self._form = columns
         self.answer_bytes += columns.nbytes + length
-        start = slabs.INFOS
-        with UNTRUSTED:
-            packed = bytes(self._reply[start : start + length])
-            borrows = _borrows(slots)
-            return m.StepDone(*columns.read(slots.memory, packed, to_tensor, borrows=borrows))
+        packed = bytes(self._reply[slabs.INFOS : slabs.INFOS + length]) if length else b""
+        return columns.read(slots.memory, packed, to_tensor, borrows=slots.chosen != _SPARE)
 
-    @property
-    def form_is_checked(self) -> bool:
-        """Whether the last answer was a step of a form that ``note_checked`` was said of."""
-        return self._form is not None and self._form is self._checked_form
+    def checked_step(self) -> list[Any] | None:
+        """The fields of the answer to a step, if it came as columns that ``note_checked`` was said
+        of; as ``answer``.
+        """
+        tells, slots, columns = self._tells, self._answer_slots, self._step_columns
+        if columns is None or columns is not self._checked_form or slots is None:
+            return None
+        if tells[slabs.OUTCOME] != slabs.COLUMNS:
+            return None
+        return self._step_of_columns(tells[slabs.LENGTH], slots)
 
     def note_checked(self) -> None:
-        """The last answer's classes, dtypes and shapes are as declared."""
+        """The classes, dtypes and shapes of the last answer, a step's, are as declared."""
         if self._form is not None:
             self._checked_form = self._form
 
@@ -334,10 +338,6 @@ class ShardSlabs:
         self._tells.release()
         self._answers.release()
         # the maps go with the last array over them
-
-
-def _borrows(slots: SlotRing | None) -> bool:
-    return slots is not None and slots.chosen != _SPARE
 
 
 def _members(known: Any, column: Any) -> Sequence[Any]:

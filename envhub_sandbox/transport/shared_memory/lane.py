@@ -77,6 +77,7 @@ class SharedMemoryLane(SlabLane):
         may_spin = _ORDERED_STORES and workers < len(own_cpus())
         self._spin = self._step_spin = SpinChooser(may_spin)
         self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
+        self._checked: list[Any] | None = None  # a step that needs no further check
         self._listens = False
         # One core is the client's. Shards that find no other sleep until they are asked, then run
         # on the client's while it sleeps: so it waits for those first, and for the others awake.
@@ -224,21 +225,26 @@ class SharedMemoryLane(SlabLane):
 
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""
+        self._checked = None  # that of a step that was interrupted
         if self._asked == BY_SERVER:
             super().wait(deadline)
-        else:
-            self._answers = self.replies(deadline)
+            return
+        deaths = self._wait_for_all(deadline)
+        # of several shards, results are always looked into
+        if self._asked == STEP and not deaths and not self.declared.looks_inside:
+            self._checked = self.shards[0].checked_step()
+        if self._checked is None:
+            self._answers = self._replies(deaths, deadline)
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
         """See ``Lane``. Results of a form that has been checked before are not checked again."""
-        if self._asked != STEP or infos is not None or self.declared.looks_inside:
-            return super().result(infos)
-        [shard] = self.shards  # more than one are looked into
-        if shard.form_is_checked:
-            observation, rewards, ended, cut, own = m.values_of(self._answers.pop())
+        checked, self._checked = self._checked, None
+        if checked is not None and infos is None:
+            observation, rewards, ended, cut, own = checked
             return observation, rewards, ended, cut, own
-        done = super().result()
-        shard.note_checked()
+        done = super().result(infos)
+        if self._asked == STEP:
+            self.shards[0].note_checked()
         return done
 
     def leave_slots(self) -> None:
@@ -253,10 +259,12 @@ class SharedMemoryLane(SlabLane):
 
     def replies(self, deadline: Deadline) -> list[m.Message]:
         """See ``Lane``."""
-        operation = self._asked
-        if operation == BY_SERVER:
+        if self._asked == BY_SERVER:
             return super().replies(deadline)
-        deaths = self._wait_for_all(deadline)
+        return self._replies(self._wait_for_all(deadline), deadline)
+
+    def _replies(self, deaths: dict[int, WorkerDiedError], deadline: Deadline) -> list[m.Message]:
+        operation = self._asked
         living = [index for index in range(len(self.shards)) if index not in deaths]
         answers = {index: self.shards[index].answer(self.jail.limits) for index in living}
         missing = [index for index, answer in answers.items() if answer is None]

@@ -21,7 +21,7 @@ import numpy as np
 
 from envhub_worker.protocol.codec import arrays
 from envhub_worker.protocol.codec.decoder import TensorMaker
-from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.errors import UNTRUSTED, RemoteProtocolError
 from envhub_worker.protocol.messages.forms import IrregularError
 from envhub_worker.protocol.shared_memory.words import INFO_BYTES, LINE
 
@@ -154,7 +154,6 @@ class StepColumns:
         """The fields of the message; fresh, but for large arrays if it ``borrows``.
         ``memory``: the slot. Trust: input from the worker.
         """
-        scalars = self._read_scalars(packed) if self._scalars or packed else ()
         if borrows:
             found = [_borrowed(memory, *place) for place in self._arrays]
         else:
@@ -163,14 +162,16 @@ class StepColumns:
             found = [copy() for copy in self._copies[1]]
         for index, name in self._tensors:
             found[index] = tensors(found[index], name)
-        each = iter(scalars), iter(found)
-        return [make(*each) for _, make in self._fields]
-
-    def _read_scalars(self, packed: bytes) -> list[Any]:
-        scalars = msgpack.unpackb(packed, strict_map_key=False)
-        if type(scalars) is not list or list(map(type, scalars)) != self._scalars:
-            raise RemoteProtocolError("the worker wrote other scalars than it had announced")
-        return scalars
+        scalars: Iterator[Any] = iter(())
+        taken = iter(found)
+        if not self._scalars and not packed:
+            return [make(scalars, taken) for _, make in self._fields]
+        with UNTRUSTED:
+            read = msgpack.unpackb(packed, strict_map_key=False)
+            if type(read) is not list or list(map(type, read)) != self._scalars:
+                raise RemoteProtocolError("the worker wrote other scalars than it had announced")
+            scalars = iter(read)
+            return [make(scalars, taken) for _, make in self._fields]
 
 
 def _packed(scalars: list[Any]) -> bytes:
