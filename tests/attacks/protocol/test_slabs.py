@@ -313,7 +313,7 @@ def test_columns_of_a_step_are_numbers_and_texts_of_its_form(scalars: bytes, ref
     assert layout is not None
     ring = SlotRing(1, SLOT, SLOT)
     shard = LaneShard(layout, ring.fd)
-    shard.tell(m.pack(m.Step(1, np.zeros((2, 2)))), (0, 0, 0), ring)
+    shard.write_message(m.pack(m.Step(1, np.zeros((2, 2)))), (0, 0, 0), ring)
     columns = struct.pack("QQ", slabs.COLUMNS, len(scalars))
     attack(shard, f"os.pwrite(reply, {columns!r}, {slabs.OUTCOME * 8})")
     with pytest.raises(RemoteProtocolError, match="impossible answer"):
