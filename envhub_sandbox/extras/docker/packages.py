@@ -97,13 +97,13 @@ def image_packages(engine: Engine, image: str) -> tuple[Interpreter, dict[str, I
     Raises ``SandboxUnavailableError``: it is none of ours.
     """
     try:
-        said = engine.run(
+        answer = engine.run(
             *("run", "--rm", "--no-healthcheck", "--network", "none", "--read-only"),
             *("--cap-drop", "ALL", "--security-opt", "no-new-privileges", "--pull", "never"),
             *(word for limit in own_limits(engine) for word in ("--ulimit", limit)),
             *("--entrypoint", _INTERPRETER, image, "-I", "-S", "-c", _ASK),
         )
-        implementation, version, machine, libc, there = json.loads(said)
+        implementation, version, machine, libc, there = json.loads(answer)
         installed = {
             str(name): InstalledPackage(str(version), tuple(map(str, requires)))
             for name, (version, requires) in there.items()

@@ -78,8 +78,8 @@ class Watch:
 
     def hear(self, line: str) -> None:
         """Note what uv says that it downloads: a package is no smaller once it is unpacked."""
-        if found := _ANNOUNCED.fullmatch(line):
-            self._announced += int(float(found[2]) * _UNITS[found[3]])
+        if match := _ANNOUNCED.fullmatch(line):
+            self._announced += int(float(match[2]) * _UNITS[match[3]])
 
     def look(self) -> None:
         """Refuse to go on over a bound, or where a disk is as good as full."""

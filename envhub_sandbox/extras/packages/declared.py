@@ -66,14 +66,14 @@ class Source:
 
 def of_git(requirement: Requirement, where: str) -> Source | None:
     """The repository that a requirement names; None for what is no ``git+https`` at a revision."""
-    found = _GIT.fullmatch(requirement.url or "")
-    if found is None or ".." in found[0]:
+    match = _GIT.fullmatch(requirement.url or "")
+    if match is None or ".." in match[0]:
         return None
     return Source(
         canonicalize_name(requirement.name),
-        url=found["url"],
-        commit=found["revision"] or "HEAD",
-        subdirectory=found["folder"] or "",
+        url=match["url"],
+        commit=match["revision"] or "HEAD",
+        subdirectory=match["folder"] or "",
         where=where,
     )
 

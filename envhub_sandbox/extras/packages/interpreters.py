@@ -149,12 +149,12 @@ def _others(wanted: SpecifierSet) -> list[Interpreter]:
     # which may be another user's; this glob finds nothing where it may not look
     paths = glob.glob(f"{glob.escape(root)}/versions/3.*/bin/python3")
     try:
-        found = uv.run(
+        answer = uv.run(
             ["python", "list", "--no-config", "--only-installed", "--output-format", "json"],
             what="no interpreter was found",
             timeout_s=_FIND_S,
         )
-        paths += [str(row["path"]) for row in json.loads(found) if _may_be(row)]
+        paths += [str(row["path"]) for row in json.loads(answer) if _may_be(row)]
     except (DependencyError, ValueError, LookupError, TypeError):
         pass  # there is none that uv finds
     newest: dict[str, Interpreter] = {}

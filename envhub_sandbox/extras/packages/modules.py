@@ -195,7 +195,7 @@ def note_missing(snapshot: Snapshot, said: str) -> bool:
     """
     from envhub_sandbox.extras.sources.parsing import of_module
 
-    module = found[1][:_LONGEST] if (found := re.search(_MISSING, said)) else ""
+    module = match[1][:_LONGEST] if (match := re.search(_MISSING, said)) else ""
     known = read(snapshot)
     names = _WORKERS.union(name.partition(".")[0] for name, _, _ in known)
     noted = sum(line == 0 for _, _, line in known)
@@ -250,7 +250,7 @@ class MissingModule:
         """
         from envhub_sandbox.extras.packages.declared import declared
 
-        module = found[1] if (found := re.search(_MISSING, said)) else ""
+        module = match[1] if (match := re.search(_MISSING, said)) else ""
         try:
             says = declared(self.snapshot.root, self.snapshot.path)
         except DependencyError as error:

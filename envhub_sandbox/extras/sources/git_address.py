@@ -33,8 +33,8 @@ _URL = r"([a-z]+)://([A-Za-z0-9][A-Za-z0-9.-]*(?::\d{1,5})?)(/[A-Za-z0-9_.~/+%-]
 
 def is_url(text: str) -> bool:
     """Whether git may be given it: nothing in it is an option, a login or another protocol."""
-    found = re.fullmatch(_URL, text)
-    return found is not None and found[1] in PROTOCOLS
+    match = re.fullmatch(_URL, text)
+    return match is not None and match[1] in PROTOCOLS
 
 
 def read(text: str) -> Parts:

@@ -88,8 +88,8 @@ def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
     names = ["HEAD"] if revision == "HEAD" else names
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
         git = _Git(Path(place), variables)
-        said = git.run("ls-remote", "--quiet", _checked(url), *names)
-    rows = said.decode("utf-8", "replace").splitlines()  # other names may end with these
+        answer = git.run("ls-remote", "--quiet", _checked(url), *names)
+    rows = answer.decode("utf-8", "replace").splitlines()  # other names may end with these
     found = {name: commit for commit, _, name in (row.partition("\t") for row in rows)}
     commit = next((found[name] for name in names if name in found), "")
     if not is_commit(commit):
@@ -202,10 +202,10 @@ def _rows(file: IO[bytes], title: str) -> Iterator[bytes]:
 
 def _blobs(rows: Iterable[bytes], title: str, submodules: list[str]) -> Iterator[GitBlob]:
     for row in rows:
-        found = _ROW.fullmatch(row)
-        if found is None:
+        match = _ROW.fullmatch(row)
+        if match is None:
             raise SnapshotError(f"{title}: git lists {row[:200]!r}")
-        mode, kind, digest, size, name = found.groups()
+        mode, kind, digest, size, name = match.groups()
         path = os.fsdecode(name)
         if kind == b"blob":
             executable, is_link = mode == b"100755", mode == b"120000"

@@ -201,8 +201,8 @@ def _imported_by_name(called: list[str], node: ast.Call) -> Iterator[tuple[str, 
     for keyword in node.keywords:
         value = keyword.value.value if isinstance(keyword.value, ast.Constant) else None
         text = value[:LONGEST] if isinstance(value, str) else ""
-        if keyword.arg == "entry_point" and (found := _ENTRY_POINT.fullmatch(text)):
-            yield found[1], [found[2]]
+        if keyword.arg == "entry_point" and (match := _ENTRY_POINT.fullmatch(text)):
+            yield match[1], [match[2]]
 
 
 def _drawn(node: ast.Call) -> Iterator[str]:

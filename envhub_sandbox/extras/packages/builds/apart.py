@@ -60,15 +60,15 @@ def _asked(order: dict[str, Any], title: str) -> str:
                 reason="integrity",
             ) from None
     try:
-        said: dict[str, str] = json.loads(done.stdout)
+        answer: dict[str, str] = json.loads(done.stdout)
     except ValueError:
         shown = printable(done.stderr.decode("utf-8", "replace")[-_SHOWN:], _SHOWN)
         raise DependencyError(
             f"{title} cannot be read: the process that reads it ended ({done.returncode}).\n{shown}"
         ) from None
-    if "error" in said:
-        raise DependencyError(said["error"], reason=known_reason(said["reason"]))
-    return said["answer"]
+    if "error" in answer:
+        raise DependencyError(answer["error"], reason=known_reason(answer["reason"]))
+    return answer["answer"]
 
 
 def main(owner: int) -> int:

@@ -53,8 +53,8 @@ def _in_jail(order: Mapping[str, Any], folder: Path) -> Path | tuple[str, ...]:
     ``factory/builder.py``; limits, profile and what the jail may read are added here. Raises
     ``BuildFailedError``, or ``DependencyError`` where there is no jail on this host.
     """
-    said = _run(order, folder)
-    further, name = said.get("requires"), said.get("wheel")
+    answer = _run(order, folder)
+    further, name = answer.get("requires"), answer.get("wheel")
     if isinstance(further, list) and 0 < len(further) <= _MOST_REQUIRED:
         return tuple(text for text in further if isinstance(text, str))
     if not isinstance(name, str):
@@ -82,22 +82,22 @@ def _run(order: Mapping[str, Any], folder: Path) -> dict[str, Any]:
             timeout=WALL_S + _AROUND_S,
         )
     try:
-        said: dict[str, Any] = json.loads(done.stdout)
+        answer: dict[str, Any] = json.loads(done.stdout)
     except ValueError as error:
         shown = printable(done.stderr.decode("utf-8", "replace")[-_SHOWN:])
         raise DependencyError(f"the program that builds failed:\n{shown}") from error
-    if "error" in said:
-        kind = getattr(errors, str(said["error"]), DependencyError)
-        text = str(said["said"])
+    if "error" in answer:
+        kind = getattr(errors, str(answer["error"]), DependencyError)
+        text = str(answer["said"])
         if issubclass(kind, errors.SandboxUnavailableError):
             raise DependencyError(
                 f"sources are built in a jail, and there is none here: {text}. A weaker profile "
                 f"for builds is chosen by {PROFILE_VARIABLE}, as in {PROFILE_VARIABLE}=no-userns"
             )
         raise DependencyError(text)
-    if "failed" in said:
-        raise BuildFailedError(printable(str(said["failed"])[-_SHOWN:], _SHOWN))
-    return said
+    if "failed" in answer:
+        raise BuildFailedError(printable(str(answer["failed"])[-_SHOWN:], _SHOWN))
+    return answer
 
 
 Choose = Callable[[PackageRequest, Interpreter, Tell], Lock]

@@ -112,10 +112,10 @@ def advice(log: str) -> str:
         return f"It needs {program}, which is not found here. {_install(_PROGRAMS[program])}"
     if _COMPILERS.search(log):
         return f"It needs a C or C++ compiler, and none is found here. {_install('gcc g++')}"
-    if found := _HEADER.search(log):
-        package = _HEADERS.get(found[1], "")
+    if match := _HEADER.search(log):
+        package = _HEADERS.get(match[1], "")
         how = _install(package) if package else "Install the development package that has it"
-        return f"It needs the header {found[1]}, which is not found here. {how}"
+        return f"It needs the header {match[1]}, which is not found here. {how}"
     if library := _LIBRARY.search(log):
         needs = f"It needs the library {library[1]}, which is not found here"
         return f"{needs}. Install the development package that has it"
