@@ -250,8 +250,11 @@ class FleetRequests(RequestOrder):
             count = self.results.manifest.num_envs
             self._each[0].refuse_whole(operation, message_for, count)
             raise
-        pairs = zip(self._each, packed, strict=True)
-        self._send([partial(each.submit_packed, operation, request) for each, request in pairs])
+
+        def send(at: int) -> None:
+            self._each[at].submit_packed(operation, packed[at])
+
+        self._send(send)
         self._counters.requests += 1
         self._recorder.requested(_joined(packed, self.results.bounds))
 
@@ -260,7 +263,11 @@ class FleetRequests(RequestOrder):
     ) -> list[m.M]:
         """See ``Requests.collect``: the replies of all parts, in order."""
         deadline = deadline_of(timeout)
-        replies = self._of_all([partial(each.collect, deadline, kind) for each in self._each])
+
+        def take(at: int) -> list[m.M]:
+            return self._each[at].collect(deadline, kind)
+
+        replies = self._of_all(take)
         self.note_answered(kind)
         return [*chain.from_iterable(replies)]
 
@@ -268,18 +275,22 @@ class FleetRequests(RequestOrder):
         self, operation: str, replies: list[m.Value] | list[m.WatchDone]
     ) -> tuple[Any, ...]:
         """One value for each sub-environment; a part whose reply is none of these is given up."""
-        pairs: Any = zip(self._each, replies, strict=True)
-        values = self._of_all([partial(each.one_each, operation, [reply]) for each, reply in pairs])
-        return tuple(chain.from_iterable(values))
+
+        def take(at: int) -> tuple[Any, ...]:
+            own: list[Any] = [replies[at]]
+            return self._each[at].one_each(operation, own)
+
+        return tuple(chain.from_iterable(self._of_all(take)))
 
     def finish_reset(
         self, replies: list[m.ResetDone], timeout: float | Deadline | None
     ) -> tuple[Any, dict[Any, Any]]:
         """See ``Requests.finish_reset``."""
-        pairs = zip(self._each, replies, strict=True)
-        parts = self._of_all(
-            [partial(each.finish_reset, [reply], timeout) for each, reply in pairs]
-        )
+
+        def take(at: int) -> tuple[Any, dict[Any, Any]]:
+            return self._each[at].finish_reset([replies[at]], timeout)
+
+        parts = self._of_all(take)
         try:
             result = self.results.joined_resets(parts)
         except batches.Misfit:
@@ -300,8 +311,12 @@ class FleetRequests(RequestOrder):
         rows = batches.split(self._space, actions, self.results.bounds)
         packed = self._packed(actions, rows) if self._may_not_fit else [None] * len(rows)
         self._sent_ns = perf_counter_ns()
-        steps = zip(self._each, rows, packed, strict=True)
-        self._send([partial(each.submit_step, *own) for each, *own in steps])
+        each = self._each
+
+        def send(at: int) -> None:
+            each[at].submit_step(rows[at], packed[at])
+
+        self._send(send)
         self._counters.requests += 1
         self._recorder.step(actions)
 
@@ -326,8 +341,7 @@ class FleetRequests(RequestOrder):
             deadline = deadline_of(timeout)
         # in turns, so that each worker is waited for as often before the others as after them
         self._first = (self._first + 1) % len(self._each)
-        waits = [partial(self._collect_step, deadline, at) for at in range(len(self._each))]
-        parts = self._of_all(waits, self._first)
+        parts = self._of_all(partial(self._collect_step, deadline), self._first)
         self._counters.stepped(perf_counter_ns() - self._sent_ns)
         try:
             result = self.results.joined_steps(parts)
@@ -345,12 +359,17 @@ class FleetRequests(RequestOrder):
 
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
         """Fetch the last infos of all parts again, one by one, since they do not fit together."""
-        asks = [partial(each.checked_own_infos, deadline) for each in self._each]
-        own = self._of_all(asks)
+        failed = False
+
+        def take(at: int) -> list[m.Value]:
+            return self._each[at].checked_own_infos(deadline, failed=failed)
+
+        own = self._of_all(take)
         try:
             infos = self.results.joined_own([*chain.from_iterable(own)])
         except RemoteEnvError:
-            self._of_all([partial(ask, failed=True) for ask in asks])
+            failed = True
+            self._of_all(take)
             raise
         pairs = zip(self._each, self.results.bounds, strict=True)
         fresh = [bounds for requests, bounds in pairs if requests.came_back]
@@ -395,12 +414,12 @@ class FleetRequests(RequestOrder):
         if not self._starting.wait(_ENDS_S):
             raise WorkerTimeoutError("processes are still being started; call reset() again")
 
-    def _send(self, sends: Sequence[Callable[[], None]]) -> None:
+    def _send(self, send: Callable[[int], None]) -> None:
         """Send to each part. A failure after others were sent theirs is kept for ``_of_all``."""
         self._unsent = {}
-        for at, send in enumerate(sends):
+        for at in range(len(self._parts)):
             try:
-                send()
+                send(at)
             except Exception as error:
                 if at == 0:
                     with self._parts[at].naming():
@@ -408,15 +427,15 @@ class FleetRequests(RequestOrder):
                 self._unsent[at] = error
                 self._each[at].fall_behind()
 
-    def _of_all(self, calls: Sequence[Callable[[], T]], first: int = 0) -> list[T]:
-        """Make all calls, then raise the first failure: interruption.md, rule 17."""
+    def _of_all(self, take: Callable[[int], T], first: int = 0) -> list[T]:
+        """Call for every part, then raise the first failure: interruption.md, rule 17."""
         failures, self._unsent = self._unsent, {}
         taken: dict[int, T] = {}
-        count = len(calls)
+        count = len(self._parts)
         for at in chain(range(first, count), range(first)):
             if at not in failures:
                 try:
-                    taken[at] = calls[at]()
+                    taken[at] = take(at)
                 except Exception as error:
                     failures[at] = error
         if failures:
