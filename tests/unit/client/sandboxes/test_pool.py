@@ -134,8 +134,12 @@ def test_all_are_ended_at_exit_and_none_is_kept(pool: Pool) -> None:
     assert late.server.ends == here()
 
 
-def test_a_fork_starts_its_own(pool: Pool) -> None:
-    ours = pool.acquire("key", Server)
+def test_a_fork_has_servers_of_its_own(pool: Pool) -> None:
+    """Its parent's stay as they are, in use and idle, and it waits for no lock of another thread:
+    of one that its parent has, nor of one of its own.
+    """
+    ours, idle = [pool.acquire("key", Server)], given_up(pool, "idle", 600)
+    server = ours[0].server
     held, done = threading.Event(), threading.Event()
 
     def start() -> Server:
@@ -143,38 +147,31 @@ def test_a_fork_starts_its_own(pool: Pool) -> None:
         done.wait(60)
         return Server()
 
-    thread = threading.Thread(target=pool.acquire, args=("other", start))
+    thread = threading.Thread(target=pool.acquire, args=("slow", start))
     thread.start()
     assert held.wait(60)
     child = os.fork()
     if child == 0:  # pragma: no cover
-        os._exit(0 if pool.acquire("key", Server).server is not ours.server else 1)
+        code = 1
+        try:
+            threading.Timer(60, os._exit, [1]).start()  # which ends what hangs
+            held.clear()
+            threading.Thread(target=pool.acquire, args=("other", start)).start()
+            assert held.wait(50)
+            assert pool.acquire("key", Server).server is not server
+            own = given_up(pool, "idle", 0.01)
+            assert own is not idle
+            assert eventually(lambda: bool(own.ends))
+            ours[0].release()
+            ours.clear()
+            code = int(bool(server.ends or idle.ends))
+        finally:
+            os._exit(code)
+    assert os.waitpid(child, 0)[1] == 0
     done.set()
     thread.join()
-    assert os.waitpid(child, 0)[1] == 0
-
-
-def test_a_fork_gives_nothing_back(pool: Pool) -> None:
-    """It waits for no lock, not even for one of its own: as it forgets what its parent used."""
-    ours = [pool.acquire("key", Server)]
-    server = ours[0].server
-    child = os.fork()
-    if child == 0:  # pragma: no cover
-        held = threading.Event()
-
-        def start() -> Server:
-            held.set()
-            threading.Event().wait()
-            raise AssertionError
-
-        threading.Timer(60, os._exit, [1]).start()  # which ends what hangs
-        threading.Thread(target=pool.acquire, args=("other", start)).start()
-        code = 0 if held.wait(50) else 1
-        ours[0].release()
-        ours.clear()
-        os._exit(1 if server.ends else code)
-    assert os.waitpid(child, 0)[1] == 0
-    assert (ours[0].users(), server.ends) == (1, [])
+    assert (ours[0].users(), server.ends, idle.ends) == (1, [], [])
+    assert pool.acquire("idle", Server).server is idle
 
 
 def test_a_use_that_is_lost_is_given_back(pool: Pool) -> None:
@@ -247,7 +244,7 @@ def test_an_idle_one_that_has_died_is_ended_by_the_next(pool: Pool, idle_s: floa
 
 
 def test_one_that_ends_delays_no_fresh_one(pool: Pool) -> None:
-    """From the moment on that its time has come it is not handed on, and its end not waited for."""
+    """Once its time has come it is not handed on; only the end of the process waits for its end."""
     use = pool.acquire("key", Server, 0.01)
     old = use.server
     old.may_end.clear()
@@ -255,8 +252,9 @@ def test_one_that_ends_delays_no_fresh_one(pool: Pool) -> None:
     assert old.ending.wait(60)
     fresh = pool.acquire("key", Server)
     assert fresh.server is not old
-    old.may_end.set()
-    assert eventually(lambda: bool(old.ends))
+    threading.Timer(0.1, old.may_end.set).start()
+    pool.stop_idle()
+    assert old.ends == ["envhub-idle"]
     assert not fresh.server.ends
 
 
@@ -277,34 +275,6 @@ def test_many_at_once_share_the_idle_one(pool: Pool) -> None:
     for thread in threads:
         thread.join()
     assert not wrong
-
-
-def test_the_end_waits_for_what_is_ending(pool: Pool) -> None:
-    use = pool.acquire("key", Server, 0.01)
-    server = use.server
-    server.may_end.clear()
-    use.release()
-    assert server.ending.wait(60)
-    threading.Timer(0.1, server.may_end.set).start()
-    pool.stop_idle()
-    assert server.ends == ["envhub-idle"]
-
-
-def test_a_fork_has_no_idle_one_and_ends_none(pool: Pool) -> None:
-    ours = given_up(pool, "key", 600)
-    child = os.fork()
-    if child == 0:  # pragma: no cover
-        code = 1
-        try:
-            own = given_up(pool, "key", 0.01)
-            assert own is not ours
-            assert eventually(lambda: bool(own.ends))
-            assert not ours.ends
-            code = 0
-        finally:
-            os._exit(code)
-    assert os.waitpid(child, 0)[1] == 0
-    assert pool.acquire("key", Server).server is ours
 
 
 def test_a_container_changes_hands_only_when_it_is_idle(

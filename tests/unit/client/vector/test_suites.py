@@ -150,18 +150,26 @@ def test_several_are_played_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found == {"a": {0: 0, 1: 1, 2: 2}, "b": {"last": "last"}}
 
 
-def test_the_first_failure_ends_it() -> None:
-    """No further task is begun, all are closed, and what was raised is raised."""
+@pytest.mark.parametrize("failure", [KeyError("this one"), KeyboardInterrupt()])
+@pytest.mark.parametrize("fails", ["play", "prewarm", "close"])
+def test_the_first_failure_ends_it(fails: str, failure: BaseException) -> None:
+    """Of a play, a start ahead or a close: no other task begins, all are closed, it is raised."""
     suites, played = _suites(9), []
+
+    def fail() -> None:
+        suites["a"][2].state = "closed" if fails == "close" else "new"
+        raise failure
 
     def play(suite: str, task: Any, env: Any) -> None:
         played.append(task)
-        if task == 2:
-            raise KeyError("this one")
+        if fails == "play" and task == 2:
+            fail()
 
-    with pytest.raises(KeyError, match="this one"):
-        TaskMap(suites, play, 1).run()
-    assert played == [0, 1, 2]
+    if fails != "play":
+        setattr(suites["a"][2], fails, fail)
+    with pytest.raises(type(failure)):
+        TaskMap(suites, play, 2 if fails == "prewarm" else 1).run()
+    assert played == ([0] if fails == "prewarm" else [0, 1, 2])
     assert {env.state for tasks in suites.values() for env in tasks.values()} == {"closed"}
 
 
@@ -180,29 +188,3 @@ def test_bounds_that_permit_nothing_are_refused(memory: Any, most: Any, why: str
     assert live_tasks("16G", None, 4 * GIB) == 4
     assert live_tasks(16 * GIB, 3, 4 * GIB) == 3
     assert live_tasks(None, 7, 0) == 7
-
-
-def test_a_start_ahead_that_fails_is_raised() -> None:
-    suites = _suites(4)
-
-    def refuse() -> None:
-        raise OSError("no thread is left")
-
-    suites["a"][1].prewarm = refuse
-    with pytest.raises(OSError, match="no thread"):
-        TaskMap(suites, lambda *_: None, 2).run()
-    assert {env.state for tasks in suites.values() for env in tasks.values()} == {"closed"}
-
-
-@pytest.mark.parametrize("failure", [RuntimeError("unwilling"), KeyboardInterrupt()])
-def test_a_close_that_fails_leaves_no_other_open(failure: BaseException) -> None:
-    suites = _suites(4)
-
-    def close() -> None:
-        suites["a"][0].state = "closed"
-        raise failure
-
-    suites["a"][0].close = close
-    with pytest.raises(type(failure)):
-        TaskMap(suites, lambda *_: None, 1).run()
-    assert {env.state for tasks in suites.values() for env in tasks.values()} == {"closed"}
