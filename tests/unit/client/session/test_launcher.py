@@ -256,19 +256,7 @@ def opener() -> Any:
 
 
 def test_it_is_opened_once_and_ends_with_its_last_user(opener: Any) -> None:
-    source = SharedJail(opener, lambda: None)
-    users = [source.take(Deadline(None)) for _ in range(3)]
-    assert opener.open.call_count == 1
-    for user in users:
-        assert not opener.close.called
-        source.give_back(user)
-    assert opener.close.call_count == 1
-    source.take(Deadline(None))
-    assert opener.open.call_count == 2
-
-
-def test_one_that_was_provided_and_never_taken_is_ended(opener: Any) -> None:
-    """By the close of its suite, once; while somebody uses it that ends nothing."""
+    """One that was provided ends so too, or by the close of its suite, once, if nobody uses it."""
     source = SharedJail(opener, lambda: None)
     source.provide(loaded())
     user = source.take(Deadline(None))
@@ -278,6 +266,14 @@ def test_one_that_was_provided_and_never_taken_is_ended(opener: Any) -> None:
     source.give_back(user)
     source.close()
     assert opener.close.call_count == 1
+    users = [source.take(Deadline(None)) for _ in range(3)]
+    for user in users:
+        assert (opener.open.call_count, opener.close.call_count) == (1, 1)
+        source.give_back(user)
+    assert opener.close.call_count == 2
+    source.provide(loaded())
+    source.close()
+    assert (opener.open.call_count, opener.close.call_count) == (1, 3)
 
 
 def test_a_worker_that_is_given_up_is_given_up_for_all(opener: Any) -> None:
