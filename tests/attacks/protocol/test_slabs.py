@@ -19,6 +19,7 @@ from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard, ObservationSlab, SlotRing
+from envhub_sandbox.transport.shared_memory.served_lane import ReceivedBatch, ServedShard
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.shared_memory.packets import packet_bytes, write_packet
@@ -348,3 +349,38 @@ def test_columns_of_a_step_are_numbers_and_texts_of_its_form(scalars: bytes, ref
         assert answer.observation.tobytes() == b"\x02" * 16
     shard.close()
     ring.close()
+
+
+FRAMES = {
+    "less than a header": lambda head, batch: [head[:-1]],
+    "less than the infos it speaks of": lambda head, batch: [struct.pack("<QQ", 1, 8) + batch[:4]],
+    "columns of nobody knows what": lambda head, batch: [struct.pack("<QQ", slabs.COLUMNS, 0)],
+    "a shorter batch": lambda head, batch: [head + batch[:-1]],
+    "a longer batch": lambda head, batch: [head + batch + b"x"],
+    "a longer batch in pieces": lambda head, batch: [head, batch, b"x"],
+    "an unknown outcome": lambda head, batch: [struct.pack("<QQ", 9, 0) + batch],
+}
+
+
+@pytest.mark.parametrize("lie", [None, *FRAMES])
+@pytest.mark.parametrize("size", [8, 70_000])
+def test_what_a_server_sends_of_slabs_has_the_size_that_was_agreed_on(
+    lie: str | None, size: int
+) -> None:
+    """An honest one, which is the control, is read; a byte that is no boolean becomes one."""
+    space = spaces.Box(0, 1, (size,), np.bool_)
+    layout = slabs.layout_of(spaces.Discrete(2), 2)
+    observed = slabs.observation_layout(space, 2, 1)
+    assert layout is not None
+    assert observed is not None
+    shard = ServedShard(layout, observed)
+    batch, head = b"\2" * observed.total_bytes, struct.pack("<QQ", slabs.DONE, 0)
+    if lie is not None:
+        with pytest.raises(RemoteProtocolError):
+            shard.read(FRAMES[lie](head, batch))
+        return
+    for frames in ([head + batch], [head, batch[:9], batch[9:]]):
+        assert shard.read(frames) == (slabs.DONE, None)
+        received = ReceivedBatch(space, [shard])
+        bools = [received.take(), *received.results()[1:]]
+        assert {byte for flags in bools for byte in flags.tobytes()} == {1}

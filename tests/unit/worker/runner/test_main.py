@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import socket
 from concurrent.futures import ThreadPoolExecutor
@@ -12,8 +13,11 @@ import pytest
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.stream import StreamReader, pack_packet
 from envhub_worker.runner import runner
+from envhub_worker.runner.lane import Lane
+from envhub_worker.runner.prefixes import Watches
 from tests.support.processes import eventually
 
 
@@ -34,6 +38,20 @@ class QuietLane:
     def close(self) -> None:
         os.close(self.bell)
         self.bell = -1
+
+
+def test_a_lane_that_is_closed_owes_nothing() -> None:
+    """Or a jail in which another environment lives would be taken for busy for ever."""
+    memory = [os.memfd_create(name) for name in ("request", "reply", "observations")]
+    for fd in memory:
+        os.ftruncate(fd, slabs.REPLY_BYTES)
+    request, reply = (mmap.mmap(fd, slabs.REPLY_BYTES) for fd in memory[:2])
+    bells = [os.memfd_create("bell") for _ in range(2)]
+    others: Any = [None] * 3
+    lane = Lane(m.Attach(1, 0, 0, 1), [*memory, *bells], *others, (), Watches())
+    slabs.words(request)[slabs.SEQUENCE] = 5
+    lane.close()
+    assert slabs.words(reply)[slabs.SEQUENCE] == 5
 
 
 def test_a_client_may_close_one_lane_and_then_another(monkeypatch: pytest.MonkeyPatch) -> None:
