@@ -29,7 +29,6 @@ assert util.find_spec("{PLUGIN}"), "there is no module of that name"
 
 
 def run(*command: str, cwd: Path) -> str:
-    """What a command prints; it is shown, too."""
     print("$", *command, flush=True)
     environment = {name: text for name, text in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(
@@ -79,7 +78,6 @@ def plays(folder: Path, package: Path, plugin: Path) -> None:
 
 
 def main() -> None:
-    """All of it; a command that fails is an error."""
     with tempfile.TemporaryDirectory(prefix="distributions-") as name:
         folder = Path(name)
         folder.chmod(0o755)  # jails of root run as another user

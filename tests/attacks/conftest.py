@@ -60,7 +60,6 @@ def other_cache(open_ground: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture(params=profiles("strict", "no-userns"))
 def arena(request: pytest.FixtureRequest) -> Iterator[Arena]:
-    """Where a test attacks, once for each profile."""
     made = Arena(request.param, request.node.module.FAMILY)
     yield made
     _TABLE.found(request.node, made.rows)
@@ -76,7 +75,6 @@ def strict(request: pytest.FixtureRequest) -> Iterator[Arena]:
 
 @pytest.fixture(scope="module", params=profiles("strict", "no-userns"))
 def lasting(warm_server: None, request: pytest.FixtureRequest) -> Iterator[LastingJail]:
-    """One for the attacks of a module, for each profile."""
     made = LastingJail(request.param)
     yield made
     made.close()

@@ -67,11 +67,5 @@ def depends_on_load(attack: str, conditions: Collection[str]) -> bool:
 
 
 def not_stopped(attack: str, conditions: Collection[str]) -> str | None:
-    """Why an attack gets through, or None if it must not.
-
-    Args:
-        attack: Its title.
-        conditions: The policy's profile, and what is true of this host.
-    """
     reasons = NOT_STOPPED.get(attack, {})
     return next((reasons[name] for name in conditions if name in reasons), None)

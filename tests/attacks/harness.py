@@ -52,11 +52,9 @@ class Run:
 
     @property
     def text(self) -> str:
-        """Everything that came back from it."""
         return json.dumps(self.value, default=repr) + self.error
 
     def pids(self) -> list[int]:
-        """Its live processes, by their name."""
         return pids_named(self.alias)
 
 
@@ -162,7 +160,6 @@ class Arena(Attacks):
         impossible: str = "",
         judged: str = OUTSIDE,
     ) -> None:
-        """As ``Attacks.judge``."""
         verdict = "NOT STOPPED" if through else "no proof" if impossible else "stopped"
         note = impossible or (_brief(detail) if not through else "")
         row = Row(title, self.family, self.profile, USER, control, verdict, note, judged)
@@ -176,7 +173,6 @@ class Arena(Attacks):
             raise StoppedNowError(f"{title!r} is stopped now; expectations say otherwise: {reason}")
 
     def conditions(self) -> list[str]:
-        """The profile, and what is true of this host."""
         details = [layer["detail"] for layer in self.report if layer["layer"] == "memory"]
         measured = any("measured by" in detail for detail in details)
         plain = [PLAIN] if USER == "user" else []
@@ -206,13 +202,11 @@ class Arena(Attacks):
         limits: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> Iterator[Any]:
-        """The hostile repository's environment, in a jail of its own."""
         options = {"limits": limits, "timeouts": TIMEOUTS, **self.place(policy or {}), **options}
         with make_env(str(HOSTILE), **options) as suites:
             yield suites.env
 
     def place(self, policy: Mapping[str, Any]) -> dict[str, Any]:
-        """Where the jail is, as ``make_env`` takes it."""
         return {"policy": {"profile": self.profile, **policy}}
 
 
@@ -231,12 +225,10 @@ class OpenJail(Attacks):
     prefix: str = ""
 
     def judge(self, title: str, *found: Any, **more: Any) -> None:
-        """As ``Attacks.judge``."""
         self.arena.judge(self.prefix + title, *found, **more)
 
     @contextlib.contextmanager
     def inside(self, payload: str, arguments: Mapping[str, Any]) -> Iterator[Run]:
-        """Run a payload in the jail."""
         yield run_in(self.env, payload, **arguments)
 
 
@@ -249,7 +241,6 @@ class LastingJail:
         self._env: Any = None
 
     def open(self, family: str) -> OpenJail:
-        """It, for the next attacks."""
         arena = Arena(self.profile, family)
         if self._env is None or self._env.sandbox.stats()["state"] != "READY":
             self.close()
@@ -259,20 +250,17 @@ class LastingJail:
         return OpenJail(arena, self._env)
 
     def close(self) -> None:
-        """End it."""
         self._env = None
         self._held.close()
 
 
 def run_in(env: Any, payload: str, **arguments: Any) -> Run:
-    """Run a payload in a jail that is open already."""
     run = Run(new_alias(), True)
     call(env, run, payload, arguments)
     return run
 
 
 def call(env: Any, run: Run, payload: str, arguments: Mapping[str, Any]) -> None:
-    """Have a hostile environment run a payload, and note what became of it."""
     try:
         [run.value] = env.call("attack", payload, dict(arguments), run.alias)
     except EnvHubError as error:
@@ -281,7 +269,6 @@ def call(env: Any, run: Run, payload: str, arguments: Mapping[str, Any]) -> None
 
 @contextlib.contextmanager
 def control_run(payload: str, arguments: Mapping[str, Any], secret: str = "") -> Iterator[Run]:
-    """Run a payload in a plain interpreter, which lives as long as the context."""
     run = Run(new_alias(), False)
     with answered(start_control(payload, arguments, run.alias), run, secret):
         yield run
@@ -307,7 +294,6 @@ def answered(process: subprocess.Popen[bytes], run: Run, secret: str = "") -> It
 def start_control(
     payload: str, arguments: Mapping[str, Any], alias: str, **options: Any
 ) -> subprocess.Popen[bytes]:
-    """The process that runs a payload without a sandbox, with this process's environment."""
     words = [str(HOSTILE / "outside.py"), payload, json.dumps(dict(arguments)), alias]
     return subprocess.Popen(
         [sys.executable, *words],
@@ -340,7 +326,6 @@ def new_alias() -> str:
 
 
 def token() -> str:
-    """Something that is not known by chance."""
     return secrets.token_hex(16)
 
 
@@ -354,7 +339,6 @@ def pids_named(alias: str) -> list[int]:
 
 
 def kill_named(alias: str) -> None:
-    """End what a control left behind."""
     for pid in pids_named(alias):
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -378,6 +362,5 @@ def _read(path: str) -> str:
 
 
 def _brief(detail: str) -> str:
-    """The last line of an error, or the start of an answer."""
     lines = [line.strip() for line in detail.splitlines() if line.strip()]
     return (lines[-1] if lines else "")[:120]

@@ -70,13 +70,11 @@ class Collected:
         test.user_properties += [(self._name, asdict(row)) for row in rows]
 
     def read(self, report: pytest.TestReport) -> None:
-        """Take the rows out of a report."""
         if report.when == "teardown":
             found = [row for name, row in report.user_properties if name == self._name]
             self._rows += [Row(**row) for row in found]  # type: ignore[arg-type]
 
     def write(self, session: pytest.Session) -> None:
-        """Write the page, if asked to."""
         path = os.environ.get(self._variable)
         if path and self._rows and not hasattr(session.config, "workerinput"):
             update(Path(path), self._rows, columns=self._columns, head=self._head)

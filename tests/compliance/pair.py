@@ -28,7 +28,6 @@ class Pair:
         return int(self.reference.num_envs)
 
     def sample_actions(self, seed: int, steps: int) -> list[Any]:
-        """Batches of actions, the same for the same seed."""
         space = self.reference.action_space
         space.seed(seed)
         return [space.sample() for _ in range(steps)]
@@ -41,7 +40,6 @@ class Pair:
         return actual
 
     def step(self, actions: Any, what: str = "step") -> Any:
-        """Step both and compare the five results."""
         expected = self.reference.step(actions)
         actual = self.sandboxed.step(actions)
         names = ("observations", "rewards", "terminations", "truncations", "infos")

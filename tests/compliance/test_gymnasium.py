@@ -66,7 +66,6 @@ def make(request: pytest.FixtureRequest) -> Iterator[Make]:
 
 @pytest.fixture(params=["async", "frames", "workers"])
 def halves(request: pytest.FixtureRequest) -> Make:
-    """What has ``*_async`` and ``*_wait``."""
     return partial(vector, **{"use_async_envs": True, **WAYS[request.param]})
 
 
@@ -128,7 +127,6 @@ def test_actions_and_observations_are_in_their_spaces(make: Make, space: Any) ->
 
 
 def test_spaces_may_differ_if_that_is_said(make: Make) -> None:
-    """Then the batched space has each one's bounds; else, and for other shapes, it is refused."""
     boxes = [spaces.Box(0, high, (5,)) for high in (1, 2, 3)]
     env_fns = [shown(box) for box in boxes]
     both = (spaces.Box(0, 4, (3, 5)), spaces.Box(0, 4, (5,)))

@@ -68,7 +68,6 @@ def _by_value() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A repository whose environments keep what they are given."""
     found = tmp_path_factory.mktemp("told")
     (found / "env.py").write_text(REPOSITORY)
     return found
@@ -76,7 +75,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def env(folder: Path) -> Iterator[SandboxVectorEnv]:
-    """Three sub-environments in two processes; what is handed over goes one way in either lane."""
     made = made_of(folder, n_envs=3, num_workers=2)
     made.reset()
     yield made

@@ -34,7 +34,6 @@ INFO = st.fixed_dictionaries({}, optional={**VALUES, "nested": FLAT, "deep": st.
 
 
 def added(infos: list[dict[str, Any]]) -> dict[str, Any]:
-    """What Gymnasium makes of the infos of one batch of sub-environments."""
     env: VectorEnv[Any, Any, Any] = VectorEnv()
     env.num_envs = len(infos)
     joined: dict[str, Any] = {}

@@ -69,7 +69,6 @@ json.dump(found, sys.stdout)
 
 @pytest.fixture(scope="module")
 def runtimes() -> Iterator[Any]:
-    """Gives the runtime with some requirements; each is installed once."""
     # gym has no wheels: its releases are a source distribution of pure Python
     with installed_once("gym") as runtime:
         yield runtime
@@ -149,7 +148,6 @@ def test_it_is_bit_for_bit_what_a_user_of_gym_has(
 
 
 def test_code_of_gym_has_what_numpy_took_away(runtimes: Any) -> None:
-    """``np.int``, and ``np.bool8``, which ``gym.make`` uses in each step: by hand, both fail."""
     runtime, actions = runtimes(NEWEST_NUMPY), some_actions("cartpole")
     for kind, name in (("cartpole", "bool8"), ("old_names", "int")):
         with pytest.raises(RuntimeError, match=f"attribute '{name}'"):

@@ -29,7 +29,6 @@ NEW = ("gymnasium>=1.1", "numpy>=2")
 
 @pytest.fixture(scope="session")
 def runtimes() -> Iterator[Any]:
-    """Gives the runtime with some requirements; each is installed once."""
     with installed_once() as runtime:
         yield runtime
 

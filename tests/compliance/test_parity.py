@@ -20,12 +20,10 @@ class TestCounter(VectorEnvCompliance):
     over_frames = 3
 
     def test_options_reach_the_sub_environments(self, pair: Pair) -> None:
-        """Options arrive as they were given; this sample repeats them in its info."""
         for options in (None, {}, {"level": 3, "names": ["a", "b"], "deep": {"x": (1, 2.5)}}):
             pair.reset(seed=1, options=options)
 
     def test_methods_take_arguments(self, pair: Pair) -> None:
-        """``call`` hands over positional and keyword arguments and gives a tuple of results."""
         for args, kwargs in (((1,), {}), ((1, 2), {}), ((1,), {"b": 5})):
             expected = pair.reference.call("add", *args, **kwargs)
             assert_same(expected, pair.sandboxed.call("add", *args, **kwargs), "call")
@@ -33,12 +31,10 @@ class TestCounter(VectorEnvCompliance):
         assert_same(pair.reference.call("add", 4), pair.sandboxed.call_wait(), "call_wait")
 
     def test_get_attr_calls_what_can_be_called(self, pair: Pair) -> None:
-        """``get_attr`` is ``call`` without arguments, as in Gymnasium."""
         pair.reset(seed=2)
         assert_same(pair.reference.get_attr("render"), pair.sandboxed.get_attr("render"))
 
     def test_exceptions_keep_their_builtin_class(self, pair: Pair) -> None:
-        """What a method raises can be caught as the builtin that it is; the env goes on."""
         pair.reset(seed=3)
         with pytest.raises(ValueError, match="counter 0 failed"):
             pair.sandboxed.call("fail")
@@ -49,14 +45,12 @@ class TestCounter(VectorEnvCompliance):
         pair.step(pair.sample_actions(3, 1)[0])
 
     def test_frames(self, pair: Pair) -> None:
-        """``render`` and ``call("render")`` give the reference's frames."""
         pair.reset(seed=4)
         pair.step(pair.sample_actions(4, 1)[0])
         assert_same(pair.reference.render(), pair.sandboxed.render(), "render")
         assert_same(pair.reference.call("render"), pair.sandboxed.call("render"), "call")
 
     def test_attribute_changes_the_environment(self, pair: Pair) -> None:
-        """An attribute that was set is used by the environment's own code."""
         for env in (pair.reference, pair.sandboxed):
             env.set_attr("gain", [0.5 + i for i in range(pair.num_envs)])
         pair.drive(seed=5, steps=10)
@@ -105,7 +99,6 @@ class TestCartPole(VectorEnvCompliance):
     steps = 1000
 
     def test_lane_is_the_one_that_was_asked_for(self, pair: Pair, lane: str) -> None:
-        """Spaces with a fixed layout go over shared memory unless that is forbidden."""
         pair.reset(seed=1)
         in_use = inside.lane(pair.sandboxed) is not None
         assert in_use is (lane == "auto")
@@ -150,7 +143,6 @@ class TestMiniGrid(VectorEnvCompliance):
     steps = 60
 
     def test_spaces_are_equal(self, pair: Pair) -> None:
-        """The custom space describes itself and refuses to sample; the others are equal."""
         expected = pair.reference.single_observation_space
         actual = pair.sandboxed.single_observation_space
         assert list(actual) == list(expected)

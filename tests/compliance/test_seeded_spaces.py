@@ -89,7 +89,6 @@ def test_what_nobody_seeded_starts_anywhere(folder: Path, kind: str) -> None:
 
 
 def test_a_space_that_is_asked_for_draws_the_same(folder: Path) -> None:
-    """``get_attr``, and a copy of its own: what is drawn of it there is drawn here, too."""
     env = make_env(folder, n_envs=2, num_workers=1, env_kwargs={"seed": 5}).env
     reference = LOCAL["make_env"](2, seed=5)
     for expected, found in zip(

@@ -99,7 +99,6 @@ def _alone(folder: Path, index: int, mode: str, actions: Any) -> list[Any]:
 
 
 def _row(received: Any, place: int) -> Any:
-    """One sub-environment's results, as a vector environment of one gives them."""
     rows = [column[place : place + 1] for column in received[:4]]
     return (*rows, _own(received.infos, place))
 

@@ -66,7 +66,6 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
 
 @pytest.fixture(params=WAYS)
 def make(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
-    """Makes it in a sandbox; what is made is closed."""
     made: list[Any] = []
     options: dict[str, Any] = {}
     if request.param == "tcp":
@@ -82,7 +81,6 @@ def make(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
 
 
 def facts(spec: Any) -> tuple[Any, ...]:
-    """What a spec says of an environment."""
     return spec.id, spec.max_episode_steps, spec.reward_threshold, spec.nondeterministic
 
 
@@ -190,7 +188,6 @@ def test_async_sub_environments_are_driven_together(workers: int) -> None:
 
 
 def test_a_vector_environment_without_sub_environments_says_so() -> None:
-    """``AsyncVectorEnv`` itself has no ``envs``; nothing is run to find that out."""
     options = {"env_kwargs": {"subclass": True}}
     env = vector(told(2), use_async_envs=True, shared_memory=False, options=options)
     env.reset(seed=0)

@@ -99,7 +99,6 @@ class VectorEnvCompliance:
     over_frames: ClassVar[int] = 1
 
     def test_is_an_ordinary_vector_env(self, pair: Pair) -> None:
-        """The proxy is a VectorEnv with the reference's size, render mode and metadata."""
         assert isinstance(pair.sandboxed, VectorEnv)
         assert isinstance(pair.sandboxed, SandboxVectorEnv)
         assert pair.sandboxed.unwrapped is pair.sandboxed
@@ -136,7 +135,6 @@ class VectorEnvCompliance:
         assert_same(pair.reference.np_random, pair.sandboxed.np_random, "generators")
 
     def test_step_in_two_halves(self, pair: Pair) -> None:
-        """``step_async`` and ``step_wait``, ``reset_async`` and ``reset_wait`` do the same."""
         expected = pair.reference.reset(seed=3)
         pair.sandboxed.reset_async(seed=3)
         assert_same(expected, pair.sandboxed.reset_wait(), "reset_wait")
@@ -145,7 +143,6 @@ class VectorEnvCompliance:
             assert_same(pair.reference.step(actions), pair.sandboxed.step_wait(), "step_wait")
 
     def test_halves_out_of_order_are_refused(self, pair: Pair) -> None:
-        """Waiting for nothing and asking twice raise Gymnasium's errors; the env goes on."""
         pair.reset(seed=4)
         with pytest.raises(NoAsyncCallError):
             pair.sandboxed.step_wait()
@@ -181,7 +178,6 @@ class VectorEnvCompliance:
         pair.step(pair.sample_actions(8, 1)[0])
 
     def test_masked_reset_touches_only_the_masked(self, pair: Pair) -> None:
-        """``options["reset_mask"]`` resets the masked sub-environments and no others."""
         pair.reset(seed=9)
         pair.step(pair.sample_actions(9, 1)[0])
         mask = np.arange(pair.num_envs) % 2 == 0
@@ -191,7 +187,6 @@ class VectorEnvCompliance:
             pair.step(pair.sample_actions(10, 1)[0])
 
     def test_bad_reset_mask_is_refused(self, pair: Pair) -> None:
-        """A mask of another type, shape or dtype raises what Gymnasium raises."""
         pair.reset(seed=12)
         masks: list[Any] = [[True] * pair.num_envs, np.ones(pair.num_envs + 1, bool)]
         masks += [np.ones(pair.num_envs, int), np.zeros(pair.num_envs, bool)]
@@ -203,13 +198,11 @@ class VectorEnvCompliance:
         pair.reset(seed=12)
 
     def test_wrong_number_of_seeds_is_refused(self, pair: Pair) -> None:
-        """A list of seeds of another length is a ValueError; the env goes on."""
         with pytest.raises(ValueError, match="seed"):
             pair.sandboxed.reset(seed=[1] * (pair.num_envs + 1))
         pair.reset(seed=13)
 
     def test_attribute_that_is_missing(self, pair: Pair) -> None:
-        """A missing attribute is an AttributeError that names it; the env goes on."""
         pair.reset(seed=14)
         for ask in (pair.sandboxed.call, pair.sandboxed.get_attr):
             with pytest.raises(AttributeError, match="no_such_thing"):
@@ -220,7 +213,6 @@ class VectorEnvCompliance:
         pair.step(pair.sample_actions(14, 1)[0])
 
     def test_wrong_actions_are_refused_before_they_leave(self, pair: Pair) -> None:
-        """Actions that do not fit raise, nothing is stepped, and the env goes on."""
         pair.reset(seed=15)
         for nonsense in (None, "north", object(), [[[[1]]]] * (pair.num_envs + 1)):
             with pytest.raises((TypeError, ValueError)):
@@ -228,7 +220,6 @@ class VectorEnvCompliance:
         pair.step(pair.sample_actions(15, 1)[0])
 
     def test_attribute_of_sub_environments(self, pair: Pair) -> None:
-        """``set_attr`` and ``get_attr`` reach the sub-environments, one value each or the same."""
         values = [float(i) for i in range(pair.num_envs)]
         for value in (values, tuple(values), 3, "text", np.arange(3)):
             for env in (pair.reference, pair.sandboxed):

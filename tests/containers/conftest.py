@@ -74,6 +74,5 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Write the table, if asked to; it has columns for root only."""
     if USER == "root":
         _TABLE.write(session)

@@ -22,7 +22,6 @@ IMAGE = os.environ.get("ENVHUB_TEST_IMAGE", "envhub-worker")
 
 
 def container_of(env: Any) -> str:
-    """The name of the container that an environment runs in, out of its report."""
     [detail] = [layer["detail"] for layer in env.sandbox.report() if layer["layer"] == "container"]
     found = re.search(r"envhub-[0-9a-f]{12}", detail)
     assert found is not None
@@ -30,7 +29,6 @@ def container_of(env: Any) -> str:
 
 
 def containers_of(engine: Engine, client: int) -> list[str]:
-    """Ids of all containers of a client, whatever their state."""
     label = f"label={CLIENT_LABEL}={client}"
     return engine.run("ps", "--all", "--quiet", "--filter", label).split()
 

@@ -14,7 +14,6 @@ from tests.support import inside
 def pair(
     request: pytest.FixtureRequest, case: Case, lane: str, docker: DockerSandbox
 ) -> Iterator[Pair]:
-    """The reference and the environment in a container; the tests of a case share them."""
     with paired(request.cls.sample, case, policy={"lane": lane}, sandbox=docker) as both:
         yield both
 

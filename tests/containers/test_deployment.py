@@ -27,7 +27,6 @@ _STATE = "/var/lib/envhub-worker"
 
 
 def wait_until_it_serves(engine: Engine, container: str) -> None:
-    """By its own health check, which asks by key."""
     health = [engine.command, "exec", container, "envhub-worker", "health"]
 
     def serves() -> bool:

@@ -22,7 +22,6 @@ from tests.support.started import started
 
 
 def inspected(engine: Engine, image: str) -> dict[str, Any]:
-    """What the engine knows of an image."""
     said: list[dict[str, Any]] = json.loads(engine.run("image", "inspect", image))
     return said[0]
 
@@ -34,7 +33,6 @@ def test_the_image_holds_the_worker_and_nothing_of_the_client(engine: Engine) ->
 
 
 def test_the_image_says_what_it_is(engine: Engine) -> None:
-    """Labels, a plain user, a health check, and a worker as its program."""
     config = inspected(engine, IMAGE)["Config"]
     assert config["Entrypoint"] == ["envhub-worker"]
     assert config["User"] == "65532:65532"
@@ -89,7 +87,6 @@ def test_a_hardened_container_gives_jails_every_layer(engine: Engine) -> None:
 
 
 def succeeds(engine: Engine, *arguments: str) -> bool:
-    """Whether a command of the engine does."""
     nothing = subprocess.DEVNULL
     done = subprocess.run([engine.command, *arguments], stdout=nothing, stderr=nothing)
     return done.returncode == 0
@@ -97,7 +94,6 @@ def succeeds(engine: Engine, *arguments: str) -> bool:
 
 @pytest.fixture(scope="module")
 def derived(engine: Engine) -> Iterator[dict[str, Any]]:
-    """What ``envhub image build`` says of an image for a repository with requirements."""
     said = built(engine, SAMPLES / "minigrid")
     yield said
     engine.run("image", "rm", "--force", said["image"])

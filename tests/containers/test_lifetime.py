@@ -73,7 +73,6 @@ class Client:
 
 @contextlib.contextmanager
 def client(engine: Engine, then: str = "wait") -> Iterator[Client]:
-    """A client that has stepped an environment in a container."""
     words = [str(sample("counter")), IMAGE, engine.kind, then]
     process = subprocess.Popen(
         [sys.executable, "-c", _CLIENT, *words],
@@ -114,7 +113,6 @@ def _command(pid: int) -> str:
 
 @pytest.mark.parametrize("how", ["exit", "SIGTERM", "SIGKILL"])
 def test_a_container_ends_with_its_client(engine: Engine, how: str) -> None:
-    """Whatever ends the client; its processes are gone as this machine sees them, too."""
     with client(engine, "exit" if how == "exit" else "wait") as made:
         pids = [] if how == "exit" else pids_in(engine, made.container)
         if how != "exit":
@@ -158,7 +156,6 @@ def test_client_and_monitor_killed_together_leave_no_container(engine: Engine) -
 
 
 def test_a_killed_container_is_a_dead_worker(docker: DockerSandbox, engine: Engine) -> None:
-    """A step that waits is told; the next ``make_env`` starts another."""
     with started(sample("counter"), sandbox=docker, seed=0) as env:
         engine.run("kill", container_of(env))
         actions = env.action_space.sample()
@@ -196,7 +193,6 @@ def test_environments_are_made_in_threads_at_once(docker: DockerSandbox) -> None
 
 @contextlib.contextmanager
 def idle_container(engine: Engine, labels: dict[str, str]) -> Iterator[str]:
-    """A container that was made and never started, with some labels."""
     words = [word for item in labels.items() for word in ("--label", "=".join(item))]
     name = engine.run("create", *words, IMAGE, "health").strip()
     try:

@@ -69,12 +69,10 @@ _NEEDS_SIX = importing("six", version="six.__version__")
 
 @pytest.fixture
 def published(engine: Engine) -> DockerSandbox:
-    """Such containers, of the image under test."""
     return DockerSandbox(image=IMAGE, engine=engine.kind, published=True, build_network="host")
 
 
 def inspected(engine: Engine, container: str) -> dict[str, Any]:
-    """What the engine knows of a container."""
     found: dict[str, Any] = json.loads(engine.run("inspect", container))[0]
     return found
 
@@ -168,7 +166,6 @@ def test_no_jail_reaches_the_network_that_its_container_has(
 
 @contextlib.contextmanager
 def client(system: str, then: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A client on another system, which has stepped an environment; its container."""
     words = ("-c", _CLIENT, sample("counter"), IMAGE, then)
     process = subprocess.Popen(
         command(system, *words),

@@ -87,7 +87,6 @@ def test_a_wall_that_is_missing_is_noticed(
 def test_a_path_that_is_granted_is_there_and_no_other(
     docker: DockerSandbox, open_ground: Path
 ) -> None:
-    """``policy.readable`` is mounted where it is, read-only; a container's own folders are not."""
     (open_ground / "given").write_text("of the caller's")
     policy = {"readable": [str(open_ground)]}
     with started(sample("counter"), sandbox=docker, policy=policy, seed=0):

@@ -89,14 +89,12 @@ class Entry:
     why: str = ""
 
     def source(self) -> str:
-        """Its ``env.py``."""
         body = textwrap.indent(textwrap.dedent(self.env).strip(), "    ") or "    pass"
         code, head = textwrap.dedent(self.code), textwrap.dedent(self.head)
         make = "" if "def make_env" in code else _MAKE
         return f"{head}{_BASE}\n\nclass Env(Walk):\n{body}\n\n{code}\n{make}"
 
     def write(self, folder: Path) -> Path:
-        """Write it, with the papers that every repository should have."""
         papers = {"README.md": "# Walk\n", "LICENSE": "MIT\n", "env.py": self.source()}
         for name, text in {**papers, **self.files}.items():
             path = folder / name
@@ -120,7 +118,6 @@ class Entry:
 
     @property
     def right(self) -> frozenset[str]:
-        """The checks that have to find something."""
         return frozenset({self.told, *self.also} - {""})
 
     @property

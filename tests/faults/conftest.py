@@ -42,7 +42,6 @@ def place() -> Iterator[Path]:
 
 @pytest.fixture(scope="package", autouse=True)
 def _patient() -> Iterator[None]:
-    """What a jail prints is followed however long a loaded server takes to say it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(*inside.WAIT_FOR_OUTPUT, 60.0)
         patch.setattr(*inside.WAITS_FOR_A_SERVER[0], 60.0)
@@ -57,6 +56,5 @@ def _left(folder: Path, before: Traces) -> list[str]:
 
 @pytest.fixture(scope="package")
 def neighbour(place: Path) -> Iterator[Neighbour]:
-    """Keeps the server, and is there to be disturbed."""
     with started(sample("faulty"), seed=None) as env:
         yield Neighbour(env)

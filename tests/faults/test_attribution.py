@@ -94,11 +94,9 @@ class Attribution(RuleBasedStateMachine):
             self.expected = State.READY
 
     def is_reset(self, got: Any, token: float) -> bool:
-        """Whether this is the answer to the reset with this token."""
         return bool(got[0].tolist() == [[token, 0.0]] * 2)
 
     def is_step(self, got: Any, token: float) -> bool:
-        """Whether this is the answer to the step with this token."""
         return _is_step(got, token)
 
     @precondition(lambda self: self.expected is not State.CLOSED)
@@ -118,7 +116,6 @@ class Attribution(RuleBasedStateMachine):
     @precondition(lambda self: self.expected is not State.CLOSED)
     @rule(delay=delays, wait=waits)
     def step(self, delay: float, wait: float) -> None:
-        """A step answers with its own token, or not at all."""
         token = float(next(_tokens))
 
         def ask() -> Any:
@@ -130,7 +127,6 @@ class Attribution(RuleBasedStateMachine):
     @precondition(lambda self: self.expected is not State.CLOSED)
     @rule(delay=delays, wait=waits)
     def call(self, delay: float, wait: float) -> None:
-        """A call answers with its own token, or not at all."""
         token = float(next(_tokens))
 
         def ask() -> Any:
@@ -196,14 +192,12 @@ class Attribution(RuleBasedStateMachine):
     @precondition(lambda self: self.expected is State.CLOSED)
     @rule()
     def use_when_closed(self) -> None:
-        """A closed environment does nothing any more."""
         for ask in (self.env.reset, self.env.render, lambda: self.env.step([[0.0, 0.0]] * 2)):
             with pytest.raises(ClosedEnvironmentError):
                 ask()
 
     @invariant()
     def state_is_the_expected_one(self) -> None:
-        """The table's state is the one that the answers told."""
         if hasattr(self, "env"):
             assert self.state is self.expected or (
                 # nothing was built, or a death was noticed before anything could be asked

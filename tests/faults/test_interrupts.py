@@ -23,7 +23,6 @@ lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 
 
 def made(lane: str = "auto", **options: Any) -> Any:
-    """Two sub-environments, of which the last hangs at a certain action; reset."""
     fails = options.pop("fails", {"moment": "step", "fault": "hang"})
     policy = {"lane": lane, **options.pop("policy", {})}
     suites = make_env(sample("faulty"), n_envs=2, policy=policy, env_kwargs=fails, **options)
@@ -33,7 +32,6 @@ def made(lane: str = "auto", **options: Any) -> Any:
 
 @contextmanager
 def begun(lane: str = "auto", **options: Any) -> Iterator[Any]:
-    """The environment of these, until it is closed."""
     with made(lane, **options) as suites:
         yield suites.env
 
@@ -147,7 +145,6 @@ class Inside:
 
 
 def threaded(operation: Callable[[], object]) -> tuple[threading.Thread, list[BaseException]]:
-    """Run an operation in another thread; what it raises."""
     raised: list[BaseException] = []
 
     def run() -> None:
@@ -282,7 +279,6 @@ class Closing(Lifecycle):
 
 
 def recover(env: Any) -> None:
-    """Reset after a step whose wait was interrupted."""
     inside.session(env).requests.submit_step(np.zeros(2, np.int64))
     env.reset()
 

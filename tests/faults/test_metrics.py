@@ -47,13 +47,11 @@ def scraped(registry: Any, repository: str) -> dict[Key, float]:
 
 
 def key(name: str, **labels: str) -> Key:
-    """A sample's place in ``scraped``, for the only task there is."""
     return name, frozenset({"suite": "hub_env", "task": "0", **labels}.items())
 
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
-    """A repository that no other test's numbers are about."""
     folder = tmp_path / "echo"
     folder.mkdir()
     (folder / "env.py").write_text((sample("echo") / "env.py").read_text())

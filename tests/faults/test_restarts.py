@@ -12,7 +12,6 @@ pytestmark = pytest.mark.short
 
 
 def made(**policy: Any) -> Any:
-    """Two sub-environments, of which the last ends its process when it is told to."""
     fails = {"moment": "step", "fault": "kill"}
     return make_env(sample("faulty"), n_envs=2, env_kwargs=fails, policy=policy)
 

@@ -53,7 +53,6 @@ def fresh(restart: int, rows: slice = DEAD) -> Any:
 
 
 def restarted(info: dict[str, Any], rows: slice = DEAD) -> bool:
-    """Whether the infos say of these rows, and of no other, that they came back."""
     expected = np.zeros(4, bool)
     expected[rows] = True
     both = info["worker_restarted"], info["_worker_restarted"]
@@ -318,7 +317,6 @@ def test_attributes_are_set_again_as_they_were_sent() -> None:
 def test_an_attribute_that_cannot_be_set_again_is_left_out(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """Its setter wants a reset to have been; the rows come back without it, and the log says so."""
     with begun() as env:
         env.set_attr("drawn_so_far", 0.5)
         with caplog.at_level("WARNING", "envhub_sandbox.worker"):

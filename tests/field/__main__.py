@@ -60,12 +60,10 @@ Program = Mapping[str, Any]
 
 
 def programs() -> dict[str, Program]:
-    """All of them, by name."""
     return dict(tomllib.loads(PROGRAMS.read_text()))
 
 
 def installed(folder: Path, every: Mapping[str, Program]) -> dict[str, Path]:
-    """The interpreter of each environment, made where it is not there."""
     found = {}
     for venv in sorted({one["venv"] for one in every.values()}):
         place = (folder / venv).resolve()
@@ -94,7 +92,6 @@ def outside(python: Path, code: str, traced: Path | None = None) -> bool:
 
 
 def succeeded(code: int, printed: str) -> bool:
-    """A program that ends well says so at its end."""
     return code == 0 and "ok" in printed
 
 
@@ -127,7 +124,6 @@ def unused(traces: Path) -> list[str]:
 
 
 def main() -> int:
-    """Run them, and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", help="of programs; by default all of them")

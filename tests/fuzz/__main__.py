@@ -27,7 +27,6 @@ ROOT = Path(__file__).parents[2]
 
 
 def main() -> int:
-    """Runs the child, and says what became of it."""
     options = parse()
     options.seed = random.SystemRandom().randrange(2**32) if options.seed is None else options.seed
     print(f"seed {options.seed}", flush=True)
@@ -51,7 +50,6 @@ def main() -> int:
 
 
 def parse() -> argparse.Namespace:
-    """The command line."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__)
     parser.add_argument("targets", nargs="*", help="all if none is named")
     parser.add_argument("--seed", type=int, default=None)

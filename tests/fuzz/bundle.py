@@ -66,7 +66,6 @@ def bundles(dice: Dice) -> None:
 
 
 def tidy() -> None:
-    """Remove what was written."""
     while _MADE:
         shutil.rmtree(_MADE.pop().parent, ignore_errors=True)
 

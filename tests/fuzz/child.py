@@ -54,7 +54,6 @@ def lie(name: str, number: int, seed: int, corpus: list[Frames], messages: list[
 
 
 def decoded(corpus: list[Frames]) -> list[m.Message]:
-    """The messages of a recording."""
     return [m.unpack(frames, things=DescriptionReader) for frames in corpus]
 
 
@@ -116,7 +115,6 @@ def noting(path: str, patience_s: int) -> Callable[[str], None]:
 
 
 def main() -> None:
-    """Runs a job."""
     warnings.simplefilter("ignore")
     job = json.loads(sys.argv[1])
     note = noting(job["note"], job["patience"])

@@ -107,7 +107,6 @@ class Spoiler:
         return self.array()
 
     def array(self) -> Any:
-        """An array of any dtype and shape, of a few elements."""
         shape = self.rng.choice(_SHAPES)
         made = np.zeros(shape, self.rng.choice(_DTYPES))
         if made.dtype.kind in "iuf" and made.size:
@@ -122,7 +121,6 @@ class Spoiler:
         return made
 
     def junk(self, depth: int = 0) -> Any:
-        """Anything that the wire carries."""
         rng, act = self.rng, self.rng.randrange(14)
         if act == 0 and self.donors:
             return rng.choice(self.donors)
@@ -211,7 +209,6 @@ class Spoiler:
         )
 
     def raw(self, data: bytes) -> bytes:
-        """Bytes with some changed, added, removed or doubled."""
         rng, made = self.rng, bytearray(data)
         for _ in range(rng.randrange(1, 4)):
             at = rng.randrange(len(made) + 1)
@@ -234,7 +231,6 @@ class Pairs(list[tuple[Any, Any]]):
 
 
 def rng_part(rng: random.Random, tree: Any) -> Any:
-    """Some part of a tree."""
     while isinstance(tree, list) and tree and rng.random() < 0.7:
         tree = rng.choice(tree)
         tree = rng.choice(tree) if isinstance(tree, tuple) and len(tree) == 2 else tree

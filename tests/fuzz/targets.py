@@ -73,12 +73,10 @@ class Dice:
 
     @property
     def spoiler(self) -> Spoiler:
-        """What spoils with these dice."""
         donors = [value for one in self.rng.choices(self.messages, k=3) for value in parts(one)]
         return Spoiler(self.rng, donors)
 
     def often(self) -> int:
-        """How often something is spoiled."""
         return self.rng.choice((0, 1, 1, 1, 2, 3))
 
     def spoiled(self, value: Any) -> Any:
@@ -109,7 +107,6 @@ class NotSentError(Exception):
 
 
 def parts(message: m.Message) -> list[Any]:
-    """The fields of a message."""
     return m.values_of(message)
 
 
@@ -148,7 +145,6 @@ def attempt(action: Callable[[], Any]) -> Any:
 
 
 def is_error(value: Any) -> bool:
-    """Whether an attempt was refused."""
     return isinstance(value, EnvHubError)
 
 
@@ -192,7 +188,6 @@ def results(dice: Dice) -> None:
 
 
 def final(members: list[Any]) -> Any:
-    """Final observations of every sub-environment."""
     made = np.full(len(members), None, object)
     for index, member in enumerate(members):
         made[index] = member
@@ -337,15 +332,12 @@ class _Server:
         self._answer = answer
 
     def send(self, message: m.Message, payload: object = ()) -> int:
-        """Nothing leaves."""
         return 1
 
     def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Any]]:
-        """The lie."""
         return self._answer()
 
     def request(self, message: m.Message, *, deadline: Deadline) -> tuple[m.Message, list[Any]]:
-        """The lie."""
         return self._answer()
 
     def hold(self, jail: int) -> None:

@@ -26,7 +26,6 @@ _LARGEST = 1 << 16
 
 @contextmanager
 def recording(found: dict[tuple[object, ...], Frames]) -> Iterator[None]:
-    """Every message that is unpacked here meanwhile, one of each kind and size."""
     unpack, unpack_header = jail.unpacked, m.unpack_header
 
     def listen(frames: Sequence[Any], **options: Any) -> Any:
@@ -52,7 +51,6 @@ def recording(found: dict[tuple[object, ...], Frames]) -> Iterator[None]:
 
 
 def record() -> list[Frames]:
-    """The messages of some runs."""
     found: dict[tuple[object, ...], Frames] = {}
     with recording(found):
         for name in _REPOSITORIES:

@@ -20,7 +20,6 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 
 def git_blob_id(content: bytes) -> str:
-    """The name that git gives to a file's content."""
     return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
 
 
@@ -136,7 +135,6 @@ class StubHub:
         return repository
 
     def fail(self, pattern: str, status: int = 500, **rest: Any) -> Fault:
-        """Plant a fault; see ``Fault``."""
         fault = Fault(pattern, status, **rest)
         self.faults.append(fault)
         return fault

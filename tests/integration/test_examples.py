@@ -21,7 +21,6 @@ pytestmark = pytest.mark.short
     ],
 )
 def test_example_repository(name: str, tasks: dict[str, list[int]], frame: tuple[int, ...]) -> None:
-    """Each example steps and draws, with nothing but the core dependencies."""
     with make_env(EXAMPLES / name, n_envs=2) as suites:
         assert {suite: list(group) for suite, group in suites.items()} == tasks
         for env in suites[next(iter(tasks))].values():
@@ -51,5 +50,4 @@ def test_what_an_example_needs_is_a_line_with_the_command() -> None:
     ],
 )
 def test_example_script(script: str, printed: str) -> None:
-    """Each script ends well and prints what it promises."""
     assert printed in python(EXAMPLES / script).stdout

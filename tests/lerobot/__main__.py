@@ -79,7 +79,6 @@ def make(version: str, folder: Path, source: Path | None = None) -> Path:
 
 
 def main() -> None:
-    """Run the tests with each version; exits with 1 when one of them failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.lerobot")
     parser.add_argument("versions", nargs="*", metavar="version", help=", ".join(WANTED))
     source = os.environ.get("ENVHUB_LEROBOT_SOURCE", "")

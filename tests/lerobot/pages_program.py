@@ -271,7 +271,6 @@ def freezes() -> None:
 
 
 def alike(one: Any, other: Any) -> bool:
-    """Whether two results are the same, with shapes and dtypes."""
     if isinstance(one, dict):
         return list(one) == list(other) and all(alike(one[key], other[key]) for key in one)
     if isinstance(one, tuple):

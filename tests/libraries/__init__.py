@@ -111,7 +111,6 @@ def _program(library: str) -> Path:
 
 
 def main() -> None:
-    """Run the examples; exits with 1 when one of them failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.libraries")
     parser.add_argument("libraries", nargs="*", metavar="library", default=list(WANTED))
     parser.add_argument("--below", type=Path, help="a folder for the environments, 2 GB each")

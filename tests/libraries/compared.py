@@ -23,7 +23,6 @@ def folder(env_py: str = ENV) -> str:
 
 
 def same(one: Any, other: Any) -> bool:
-    """Whether arrays, also in mappings and sequences, are equal, with their dtypes."""
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
     if isinstance(one, (list, tuple)):

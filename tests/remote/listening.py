@@ -93,7 +93,6 @@ class Listening:
         return self.log.read_text("utf-8", "replace")
 
     def noted(self) -> str:
-        """What it has written down for whoever is on its machine."""
         note = self.state / "endpoint"
         return note.read_text() if note.exists() else ""
 
@@ -106,7 +105,6 @@ class Listening:
         return found
 
     def status(self) -> dict[str, Any]:
-        """What ``envhub-worker status`` says to its operator."""
         asked = argparse.Namespace(state_dir=self.state, endpoint=None, json=True)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(*inside.STATUS_WAIT_MS, 60_000)  # an operator waits less

@@ -35,7 +35,6 @@ class Peer:
 
 @contextmanager
 def peer(server: Listening, pair: KeyPair, *, routing_id: bytes = b"") -> Iterator[Peer]:
-    """A socket with the keys of somebody."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.CURVE_SERVERKEY, bytes.fromhex(server.public))
@@ -48,7 +47,6 @@ def peer(server: Listening, pair: KeyPair, *, routing_id: bytes = b"") -> Iterat
 
 
 def brought(client: Peer, code: bytes) -> str:
-    """The name of a snapshot that has this file."""
     sha256 = hashlib.sha256(code).digest()
     offer = m.OfferSnapshot((("env.py", len(code), sha256),))
     client.ask(offer)

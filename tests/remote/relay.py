@@ -62,7 +62,6 @@ class Relay:
                 one.shutdown(socket.SHUT_RDWR)
 
     def cut(self) -> None:
-        """Break every connection that there is; new ones can be made."""
         for one in self._sockets:
             with contextlib.suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)

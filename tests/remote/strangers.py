@@ -13,7 +13,6 @@ def greeting(mechanism: bytes) -> bytes:
 
 
 def knock(port: int) -> socket.socket:
-    """A TCP connection to a port of this machine."""
     return socket.create_connection(("127.0.0.1", port), _PATIENCE_S)
 
 

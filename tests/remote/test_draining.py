@@ -24,12 +24,10 @@ _LONG = ("--drain-s", "600")
 
 
 def ends(server: Listening) -> bool:
-    """Whether it comes to its end by itself."""
     return eventually(lambda: server.process.poll() is not None)
 
 
 def operations(server: Listening) -> set[str]:
-    """What is being done in its jails."""
     return {jail["operation"] for one in server.sessions() for jail in one["jails"]}
 
 

@@ -36,7 +36,6 @@ def far() -> Iterator[OtherHost]:
 
 @pytest.fixture
 def far_server(far: OtherHost, tmp_path: Path) -> Iterator[Listening]:
-    """A server on it, which waits long for silent clients."""
     bind = f"tcp://{far.address}:5555"
     with listening(tmp_path / "server", "--idle-s", "60", bind=bind, prefix=far.prefix) as found:
         yield found

@@ -12,7 +12,6 @@ from tests.remote.listening import Listening
 
 @pytest.fixture(scope="class")
 def pair(request: pytest.FixtureRequest, case: Case, server: Listening) -> Iterator[Pair]:
-    """The reference here and the environment over there; a class's tests share them."""
     with paired(request.cls.sample, case, sandbox=server.sandbox()) as both:
         yield both
 

@@ -53,7 +53,6 @@ def bring(uploads: Uploads, *files: tuple[str, bytes], key: bytes = ALICE) -> st
 
 @pytest.fixture
 def uploads(tmp_path: Path) -> Uploads:
-    """A store for ten blocks of each client."""
     return Uploads(tmp_path / "store", Quotas(upload_bytes=10 * BLOCK_BYTES, upload_files=5))
 
 

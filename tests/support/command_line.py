@@ -20,7 +20,6 @@ COMMAND = [sys.executable, "-I", "-m", "envhub_sandbox"]
 def python(
     *arguments: str | Path, cwd: Path | None = None, code: int | None = 0, **variables: str
 ) -> subprocess.CompletedProcess[str]:
-    """Run this interpreter to its end, with this exit code unless that is None."""
     done = subprocess.run(
         [sys.executable, *map(str, arguments)],
         capture_output=True,
@@ -55,7 +54,6 @@ def document(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
 
 
 def below(pid: int) -> list[psutil.Process]:
-    """The processes below a process that may have gone."""
     with contextlib.suppress(psutil.NoSuchProcess):
         return psutil.Process(pid).children(recursive=True)
     return []
@@ -67,7 +65,6 @@ def gone(processes: list[psutil.Process]) -> bool:
 
 
 def runs(process: psutil.Process) -> bool:
-    """Whether it is there, and not only its entry; it may go while it is looked at."""
     with contextlib.suppress(psutil.NoSuchProcess):
         return bool(process.is_running() and process.status() != psutil.STATUS_ZOMBIE)
     return False

@@ -11,7 +11,6 @@ import numpy as np
 
 
 def rolled(env: Any) -> list[Any]:
-    """What a seeded reset and twenty seeded steps return."""
     found = [env.reset(seed=3)]
     env.action_space.seed(3)
     return found + [env.step(env.action_space.sample()) for _ in range(20)]
@@ -70,7 +69,6 @@ def _unfolded(value: Any) -> Any:
 
 
 def differences(expected: Any, actual: Any, path: str = "value") -> Iterator[str]:
-    """Where two values differ, in words; nothing if they are the same."""
     if type(actual).__name__ in ("RemoteEnum", "RemoteObject") and actual != expected:
         yield from _stand_in(expected, actual, path)
     elif type(expected) is not type(actual):

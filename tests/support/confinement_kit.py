@@ -82,7 +82,6 @@ class Cell:
         return runner
 
     def run(self, source: str, runner: int = 1) -> dict[str, Any]:
-        """Run ``source`` in ``runner``; see ``execute``."""
         lines = self.streams[runner]
         lines.write(json.dumps(source) + "\n")
         lines.flush()
@@ -93,7 +92,6 @@ class Cell:
         return json.loads(answer or '{"error": "the runner has gone"}')
 
     def hang_up(self, runner: int = 1) -> None:
-        """Close the runner's stream, so that it ends."""
         self.streams.pop(runner).close()
 
     def pump(self, timeout_s: float = 0.05) -> None:
@@ -110,7 +108,6 @@ class Cell:
             pass
 
     def wait_for(self, kind: type) -> Any:
-        """The first event of ``kind``, waiting for it."""
         deadline = time.monotonic() + DEADLINE_S
         while time.monotonic() < deadline:
             for event in self.events:
@@ -122,7 +119,6 @@ class Cell:
         raise AssertionError(f"no {kind.__name__} in {self.events}, output {self.output!r}")
 
     def wait_for_output(self, text: bytes) -> None:
-        """Wait until the jail has printed ``text``."""
         deadline = time.monotonic() + DEADLINE_S
         while text not in self.output:
             assert time.monotonic() < deadline, self.output
@@ -185,7 +181,6 @@ def new_cell(spawner: Spawner, snapshot: str, confinement: Confinement) -> Cell:
 
 
 def wait_until(condition: Any, what: str) -> None:
-    """Poll ``condition`` with a generous deadline."""
     deadline = time.monotonic() + DEADLINE_S
     while not condition():
         assert time.monotonic() < deadline, what

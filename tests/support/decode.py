@@ -15,6 +15,5 @@ def decode(
     tensors: TensorMaker | None = None,
     things: ThingReader | None = None,
 ) -> object:
-    """See ``Decoder``."""
     document, tail, buffers = split_frames(frames, limits)
     return Decoder(tail, buffers, limits, unpickler, tensors, things).value(document)

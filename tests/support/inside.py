@@ -83,12 +83,10 @@ def state(env: Any) -> State:
 
 
 def choice_of_runtime() -> Spot:
-    """Makes of an interpreter what a repository's jails run on."""
     return make_env, "Runtime"
 
 
 def choice_of_packages() -> Spot:
-    """Makes the packages that a repository declares."""
     return source, "packages_for"
 
 
@@ -120,7 +118,6 @@ def live_by(env: Any, lifecycle: Lifecycle) -> None:
 
 
 def manifest(env: Any) -> EnvManifest:
-    """What its worker said that it is."""
     return session(env).manifest
 
 
@@ -227,7 +224,6 @@ def server(env: Any) -> Any:
 
 
 def users(env: Any) -> int:
-    """How many uses of its worker server there are."""
     return _running(env).use.users()
 
 
@@ -240,7 +236,6 @@ def pids(env: Any) -> list[int]:
 
 
 def jails(env: Any) -> int:
-    """How many jails there are in its server, of whomever."""
     status, _ = client(env).request(m.GetStatus(), deadline=Deadline(60))
     assert isinstance(status, m.Status)
     return len(status.jails)
@@ -252,7 +247,6 @@ def request_words(lane: LaneShard) -> Any:
 
 
 def lane(env: Any) -> SharedMemoryLane | None:
-    """Its fast lane, where it has one."""
     found = session(env).lease.lane
     return found if isinstance(found, SharedMemoryLane) else None
 
@@ -296,7 +290,6 @@ def link(env: Any) -> Any:
 
 
 def link_is_up(found: Any) -> bool:
-    """Whether it is connected, as far as is known."""
     return bool(found._up)
 
 
@@ -363,7 +356,6 @@ def taking(env: Any) -> Spot:
 
 
 def started(env: Any) -> Spot:
-    """Where its history is told that it has started."""
     return session(env).recorder, "started"
 
 
@@ -400,7 +392,6 @@ def monitor_script() -> Path:
 
 
 def is_own_group(path: Path) -> bool:
-    """Whether the group of a file is this user's alone."""
     return folders._is_own_group(str(path), os.stat(path))
 
 
@@ -425,7 +416,6 @@ def self_test(jail: Any, descriptors: Iterable[int]) -> None:
 
 
 def step_aside(group: str) -> None:
-    """Move the processes of a control group to a leaf of it."""
     cgroups._step_aside(group)
 
 
@@ -435,7 +425,6 @@ def gate_of(options: Any, folder: Path, identity: Identity) -> Any:
 
 
 def public_key(gate: RemoteGate) -> bytes:
-    """The key by which a gate is known."""
     keys = gate._rules.keys
     assert keys is not None
     return keys.public
@@ -447,7 +436,6 @@ def happen(doorman: ConnectionLimiter, event: int, value: int = 0) -> None:
 
 
 def door_is_shut(doorman: ConnectionLimiter) -> bool:
-    """Whether nobody is let in at present."""
     return doorman._shut_listener is not None
 
 

@@ -91,7 +91,6 @@ def evaluate_all(
     *,
     render: bool = True,
 ) -> dict[tuple[str, Any], dict[str, Any]]:
-    """Evaluate every task, one after the other or in a pool of threads; closes each."""
     tasks = [(suite, task, env) for suite, group in envs.items() for task, env in group.items()]
     if max_parallel_tasks <= 1:
         return _one_by_one(tasks, policy, n_episodes, render)
@@ -111,7 +110,6 @@ def evaluate_all(
 
 
 def close_envs(envs: Mapping[Any, Any]) -> None:
-    """Close whatever has a ``close``, at any depth; a second time is harmless."""
     for value in envs.values():
         if isinstance(value, Mapping):
             close_envs(value)

@@ -58,7 +58,6 @@ def other_niceness() -> int:
 
 
 def may_change_niceness() -> bool:
-    """Whether a process of this user can give another one ``other_niceness``."""
     return os.nice(0) < 19 or os.geteuid() == 0
 
 
@@ -98,7 +97,6 @@ def unless_ended(pid: int) -> Iterator[None]:
 
 
 def is_stopped(pid: int) -> bool:
-    """Whether a process has been stopped by a signal."""
     return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)
 
 

@@ -8,7 +8,6 @@ from hypothesis.extra import numpy as hnp
 
 
 def objects(*items: Any) -> np.ndarray[Any, Any]:
-    """An object array of some values, whatever they are."""
     array = np.empty(len(items), dtype=object)
     for index, item in enumerate(items):
         array[index] = item

@@ -25,7 +25,6 @@ def value(document: bytes) -> list[Buffer]:
 
 
 def decode_space(value: object, *, max_elements: int) -> Space:
-    """The space that ``encode_space`` described."""
     return SpaceReader(max_elements).space(value)
 
 

@@ -11,7 +11,6 @@ from tests.support.repositories import write_repository
 
 @pytest.fixture
 def liar() -> Iterator[LyingServer]:
-    """A worker server that lies as a test says."""
     with lying() as server:
         yield server
 

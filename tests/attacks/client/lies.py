@@ -30,7 +30,6 @@ SCRIPT = "<script>steal()</script>"
 
 
 def opened(liar: LyingServer, folder: str, **options: Any) -> EnvSuites:
-    """``make_env`` by way of the liar."""
     timeouts = {"startup_s": 60.0, "step_s": 60.0, "reset_s": 60.0, "call_s": 60.0, "close_s": 1.0}
     options = {"timeouts": timeouts, "n_envs": NUM_ENVS, **options}
     return make_env(folder, sandbox=LyingSandbox(liar), **options)
@@ -38,7 +37,6 @@ def opened(liar: LyingServer, folder: str, **options: Any) -> EnvSuites:
 
 @contextmanager
 def started(liar: LyingServer, folder: str, **options: Any) -> Iterator[Any]:
-    """Its environment, after a reset."""
     with opened(liar, folder, **options) as suites:
         suites.env.reset()
         yield suites.env
@@ -92,7 +90,6 @@ class Canary:
 
 
 def nested(levels: int) -> dict[str, Any]:
-    """The description of tuples in tuples."""
     space: Any = encode_space(spaces.Discrete(2))
     for _ in range(levels):
         space = {"kind": "tuple", "spaces": [space]}
@@ -117,13 +114,11 @@ def spec_of(canary: Path) -> dict[str, Any]:
 
 
 def mt19937(**changes: Any) -> dict[str, Any]:
-    """A state, changed."""
     state = {"key": np.arange(624, dtype=np.uint32), "pos": 3, **changes}
     return {"bit_generator": "MT19937", "state": state}
 
 
 def philox(**changes: Any) -> dict[str, Any]:
-    """A state, changed."""
     four = np.zeros(4, np.uint64)
     state = {"counter": four, "key": np.zeros(2, np.uint64)}
     whole = {"state": state, "buffer": four, "buffer_pos": 4, "has_uint32": 0, "uinteger": 0}
@@ -131,13 +126,11 @@ def philox(**changes: Any) -> dict[str, Any]:
 
 
 def pcg64(inc: int = 1, **changes: Any) -> dict[str, Any]:
-    """A state, changed."""
     whole = {"state": {"state": 0, "inc": inc}, "has_uint32": 0, "uinteger": 0}
     return {"bit_generator": "PCG64", **whole, **changes}
 
 
 def sfc64(state: Any = None, **changes: Any) -> dict[str, Any]:
-    """A state, changed."""
     words = np.zeros(4, np.uint64) if state is None else state
     return {"bit_generator": "SFC64", "state": {"state": words}, "has_uint32": 0, "uinteger": 0,
             **changes}  # fmt: skip

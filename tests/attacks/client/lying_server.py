@@ -111,7 +111,6 @@ class LyingServer(WorkerServer):
         return lie(asked) if lie else [asked.answer(asked.honest)]
 
     def stop(self) -> None:
-        """End it."""
         self._stopped = True
         self._thread.join()
         self._router.close()
@@ -130,7 +129,6 @@ class LyingSandbox(Sandbox):
         self._server = server
 
     def acquire(self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0) -> Any:
-        """The liar."""
         return LyingUse(self._server)
 
 
@@ -142,13 +140,11 @@ class LyingUse:
     live: bool = True
 
     def release(self) -> None:
-        """Note it."""
         self.live = False
 
 
 @contextmanager
 def lying() -> Iterator[LyingServer]:
-    """A server without lies yet."""
     server = LyingServer()
     try:
         yield server
@@ -157,18 +153,15 @@ def lying() -> Iterator[LyingServer]:
 
 
 def env_manifest(**changes: Any) -> EnvManifest:
-    """The honest description of the environment, changed."""
     honest = {"sync": True, "type_name": "gymnasium.vector.SyncVectorEnv"}
     return wire.env_manifest(OBSERVATION, ACTION, NUM_ENVS, **(honest | changes))
 
 
 def manifest() -> dict[str, Any]:
-    """The honest manifest as it travels."""
     return encode_manifest(Manifest(envs=(env_manifest(),), lazy=True))
 
 
 def step_done(**changes: Any) -> m.StepDone:
-    """An honest step's result, changed."""
     fields: dict[str, Any] = {
         "observation": np.zeros((NUM_ENVS, 3), np.float32),
         "rewards": np.zeros(NUM_ENVS),

@@ -80,7 +80,6 @@ def followed(stub_hub: StubHub, folder: Path, most: int, token: str | bool = Fal
 
 
 def asked_for(stub_hub: StubHub, word: str) -> list[str | None]:
-    """The tokens with which the Hub was asked for this."""
     pairs = zip(stub_hub.requests, stub_hub.authorizations, strict=True)
     return [token for request, token in pairs if word in request]
 

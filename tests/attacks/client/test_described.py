@@ -53,7 +53,6 @@ def box(shape: tuple[int, ...], dtype: str = "float32") -> dict[str, Any]:
 
 
 def deep(levels: int) -> Frames:
-    """Descriptions in descriptions, as no encoder of ours makes them."""
     document = (b"\x92" + msgpack.packb(ext(SPACE))) * levels + b"\xc0"
     return [bytes(frame) for frame in value(document)]
 

@@ -53,7 +53,6 @@ def honest() -> Iterator[LyingServer]:
 
 @contextmanager
 def fleet(liar: LyingServer, honest: LyingServer, folder: str, **policy: Any) -> Iterator[Any]:
-    """An environment whose first rows are the liar's, after a reset."""
     whole = {"sync": True, "type_name": "gymnasium.vector.SyncVectorEnv"}
     described = wire.env_manifest(OBSERVATION, ACTION, ALL, **whole)
     for server in (liar, honest):
@@ -73,7 +72,6 @@ def fleet(liar: LyingServer, honest: LyingServer, folder: str, **policy: Any) ->
 
 
 def states(env: Any) -> list[str]:
-    """Those of the liar's worker and of the honest one's."""
     return [part.lifecycle.state.name for part in inside.parts(env)]
 
 

@@ -59,7 +59,6 @@ ERRORS = [
 
 @pytest.fixture
 def other(tmp_path: Path) -> Iterator[Any]:
-    """Another environment of the same client, with an honest server."""
     repository = str(write_repository(tmp_path / "other", f"# other {tmp_path}"))
     with lying() as honest, started(honest, repository) as env:
         yield env

@@ -31,7 +31,6 @@ def _done(info: Any, **changes: Any) -> m.StepDone:
 
 @contextmanager
 def _single(liar: LyingServer, folder: str, **changes: Any) -> Iterator[SingleEnv]:
-    """A single environment by way of the liar, which has been reset."""
     changes = {"sync": True, "type_name": "gymnasium.vector.SyncVectorEnv", **changes}
     described = wire.env_manifest(OBSERVATION, ACTION, 1, **changes)
     liar.lies[m.Load] = relayed(m.LoadDone(encode_manifest(Manifest(envs=(described,), lazy=True))))

@@ -160,19 +160,16 @@ def test_wrong_arrays_are_refused(liar: LyingServer, folder: str, what: str) -> 
 
 
 def described(value: object) -> Frames:
-    """An answer to Load with a hand-made manifest."""
     return m.pack(m.LoadDone(value))  # type: ignore[arg-type]
 
 
 def changed(**fields: Any) -> dict[str, Any]:
-    """The honest manifest with other fields of its environment."""
     value = manifest()
     value["envs"][0].update(fields)
     return value
 
 
 def observed(space: object) -> dict[str, Any]:
-    """The honest manifest with this description of the space of one observation."""
     return changed(single_observation_space=space)
 
 
@@ -357,14 +354,12 @@ def test_malformed_answers_of_the_server_are_refused(
 def test_answers_of_another_kind_are_refused(
     liar: LyingServer, folder: str, reply: m.Message
 ) -> None:
-    """A runner that answers with another message, be it the server's, gets no further with it."""
     liar.lies[m.Step] = relayed(reply)
     with started(liar, folder) as env:
         refuses(lambda: env.step(ACTIONS))
 
 
 def test_exceptions_choose_no_class(liar: LyingServer, folder: str) -> None:
-    """An exception names its class as text: none is looked up, imported or made."""
     before = set(sys.modules)
     names = ("SystemExit", "KeyboardInterrupt", "os.system", "antigravity.Oops", "__import__", "")
     for name in names:
@@ -377,7 +372,6 @@ def test_exceptions_choose_no_class(liar: LyingServer, folder: str) -> None:
 
 @pytest.mark.short
 def test_silence_ends_at_the_deadline(liar: LyingServer, folder: str) -> None:
-    """A worker that never answers costs the time that the caller gave, and closes in time."""
     liar.lies[m.Step] = lambda asked: []
     liar.lies[m.Close] = lambda asked: []
     timeouts = {"startup_s": 60.0, "step_s": 60.0, "reset_s": 60.0, "close_s": 0.3}
@@ -392,7 +386,6 @@ def test_silence_ends_at_the_deadline(liar: LyingServer, folder: str) -> None:
 
 
 def test_stale_unasked_and_double_answers_are_dropped(liar: LyingServer, folder: str) -> None:
-    """Answers with other ids, before, after and instead of the right one, never become results."""
     evil = step_done(rewards=np.full(NUM_ENVS, 666.0))
     good = step_done(rewards=np.full(NUM_ENVS, 1.0))
 
@@ -410,8 +403,6 @@ def test_stale_unasked_and_double_answers_are_dropped(liar: LyingServer, folder:
 
 
 def test_flood_of_unasked_answers_is_bounded(liar: LyingServer, folder: str) -> None:
-    """Thousands of unasked answers before the right one cost time, and no memory."""
-
     def lie(asked: Asked) -> list[Frames]:
         waste = step_done(info={"waste": np.zeros(MIB // 8)})
         return [
@@ -460,14 +451,12 @@ def test_parts_that_do_not_add_up_are_refused(
 def test_handshake_lies_are_refused(
     liar: LyingServer, folder: str, request_kind: type[m.Message], reply: m.Message
 ) -> None:
-    """A lie about the version, the jail or its runners ends make_env, in printable words."""
     liar.lies[request_kind] = lambda asked: [asked.answer(reply)]
     error = refuses(lambda: opened(liar, folder))
     assert "\x1b" not in str(error)
 
 
 def test_everything_else_works_on(liar: LyingServer, folder: str, tmp_path: Path) -> None:
-    """After a day of lies the same client runs an honest environment in a real sandbox."""
     text = (
         CARTPOLES + "\ndef make_env(n_envs=1, use_async_envs=False):\n    return cartpoles(n_envs)"
     )

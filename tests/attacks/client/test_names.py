@@ -56,7 +56,6 @@ ASKED = {
 
 
 def greedy(liar: LyingServer, folder: str, answer: Lie | None = None, **fields: Any) -> EnvSuites:
-    """``make_env`` of an environment that lists all of them."""
     value = manifest()
     # a manifest holds 1024 names: those that the tests below turn on come first
     first = ("__deepcopy__", "__array_interface__", "_repr_html_", "__html__", "hub_config")
@@ -117,7 +116,6 @@ class Forwarding(VectorWrapper):
 
 
 def asked_for(liar: LyingServer) -> set[str]:
-    """The names of attributes and methods that the worker was asked for."""
     kinds = (m.GetOwn, m.CallOwn, m.Call, m.GetOne, m.CallOne)
     return {request.name for request in liar.asked if isinstance(request, kinds)}
 
@@ -141,7 +139,6 @@ def test_deepcopy_hands_nothing_over(
 
 
 def test_copies_and_pickles_are_fresh_environments(liar: LyingServer, folder: str) -> None:
-    """``copy.copy``, ``copy.deepcopy`` and pickle all make another one, of the same pin."""
     with greedy(liar, folder) as suites:
         env = suites.env
         for made in (copy.copy(env), copy.deepcopy(env)):
@@ -167,7 +164,6 @@ def interface_of(memory: Any) -> Lie:
 
 
 def of_torch() -> list[Callable[[Any], object]]:
-    """What makes tensors of things, where torch is installed."""
     with contextlib.suppress(ImportError):
         torch: Any = importlib.import_module("torch")
         return [torch.as_tensor, torch.tensor, torch.from_dlpack]
@@ -397,7 +393,6 @@ def make_env(n_envs=1, use_async_envs=False):
 
 
 def attempts(env: Any, canary: Path) -> dict[str, bool]:
-    """Which attacks of the trap's succeed, judged from here."""
     canary.unlink(missing_ok=True)
     copied = copy.deepcopy([TOKEN, env])
     copied[1].close()

@@ -136,7 +136,6 @@ def become_hostile():
 
 
 def liar(folder: Path, mode: str) -> str:
-    """A repository of which one sub-environment is hostile."""
     return str(write_environment(folder / mode, _ENV.format(mode=mode, hostile=HOSTILE)))
 
 

@@ -45,7 +45,6 @@ from tests.attacks.client.lying_server import NUM_ENVS, LyingServer, env_manifes
 
 
 def specified(liar: LyingServer, folder: str, spec: dict[str, Any]) -> Any:
-    """``make_env`` of an environment with this specification."""
     value = manifest()
     value["envs"][0].update(spec=spec, shardable=False)
     liar.lies[m.Load] = relayed(m.LoadDone(value))
@@ -110,7 +109,6 @@ def test_the_control_imports_what_an_id_names(tmp_path: Path) -> None:
 
 
 def states(*each: Any) -> Any:
-    """A worker's generators, as it gives them."""
     numbered = ({**one, "number": 1} if isinstance(one, dict) else one for one in each)
     return relayed(m.Value(tuple(numbered)))
 
@@ -230,7 +228,6 @@ def test_names_of_suites_write_nothing_elsewhere(
 
 
 def test_odd_infos_are_plain_data(liar: LyingServer, folder: str) -> None:
-    """Whatever stands in an info, copying, pickling and printing it stays here."""
     odd = {"__class__": 1, "_repr_html_": SCRIPT, b"x": 2, 1.5: 3, ("a", 1): 4, None: 5}
     liar.lies[m.Reset] = relayed(m.ResetDone(np.zeros((NUM_ENVS, 3), np.float32), odd))
     with opened(liar, folder) as suites:
@@ -246,7 +243,6 @@ ELEMENTS = 100_000
 
 
 def described(space: Any = None) -> dict[str, Any]:
-    """An honest manifest with a seeded space."""
     space = spaces.Discrete(1000, seed=5) if space is None else space
     env: EnvManifest = env_manifest(single_action_space=space)
     return encode_manifest(Manifest(envs=(env,), lazy=True))

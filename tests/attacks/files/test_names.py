@@ -87,13 +87,11 @@ def test_ordinary_names_are_names_on_windows() -> None:
 
 @pytest.fixture
 def clashing(stub_hub: StubHub) -> StubRepository:
-    """A repository where the one file would take the other's place."""
     return stub_hub.add("org/repo", {"env.py": GOOD, "ENV.py": EVIL, "sub/a": b"1", "Sub/b": b"2"})
 
 
 @pytest.fixture
 def caseless(snapshot_store: Path) -> Iterator[Path]:
-    """The store, on a file system without case."""
     snapshot_store.mkdir()
     with without_case(snapshot_store):
         yield snapshot_store

@@ -48,7 +48,6 @@ def test_shared_folders_of_the_host_cannot_be_read(jail: OpenJail, folder: str) 
 
 @pytest.mark.parametrize("way", ["symlink", "hard_link", "proc"])
 def test_detours_lead_nowhere(jail: OpenJail, home: Path, way: str) -> None:
-    """A link made at run time, or a way through another process, opens nothing more."""
     secret = secret_file(home / "private")
     more = {"folders": [str(home)]} if way == "hard_link" else {}
     title = f"read a file through a {way.replace('_', ' ')}" + (" entry" if way == "proc" else "")
@@ -56,7 +55,6 @@ def test_detours_lead_nowhere(jail: OpenJail, home: Path, way: str) -> None:
 
 
 def test_links_in_the_repository_do_not_leave_it(arena: Arena, home: Path) -> None:
-    """A repository that brings a link to a file outside is refused, or the link is dead."""
     secret = secret_file(home / "private")
     folder = home / "repository"
     folder.mkdir()
@@ -102,7 +100,6 @@ def test_files_cannot_be_opened_by_handle(jail: OpenJail, home: Path) -> None:
 
 
 def file_handle(path: Path) -> tuple[str, int]:
-    """What ``name_to_handle_at`` says of a file: the handle in hex, and its type."""
     buffer = ctypes.create_string_buffer(8 + 128)
     buffer[0:4] = (128).to_bytes(4, "little")
     mount = ctypes.c_int()

@@ -26,7 +26,6 @@ FAMILY = "Changing files"
 
 
 def open_file(path: Path, text: str) -> Path:
-    """A file that everybody may write, in a folder that everybody may write."""
     if not path.parent.exists():
         path.parent.mkdir(parents=True)
         path.parent.chmod(0o777)
@@ -99,7 +98,6 @@ def test_files_outside_cannot_be_created(
 
 
 def stored(folder: Path) -> Path:
-    """A small repository's entry file, as it lies in the store."""
     folder.mkdir()
     (folder / "env.py").write_text(f"# {token()}")
     return snapshot.local(str(folder)).root / "env.py"
@@ -148,7 +146,6 @@ def test_own_snapshot_cannot_be_written(arena: Arena, home: Path, payload: str) 
 
 
 def fingerprint(tree: Path) -> dict[Path, tuple[bytes, int]]:
-    """Names, contents and modes of a snapshot's files."""
     return {
         path: (path.read_bytes(), path.stat().st_mode)
         for path in sorted(tree.rglob("*"))
@@ -203,7 +200,6 @@ def test_owner_of_files_outside_cannot_be_changed(jail: OpenJail, home: Path) ->
 
 
 def test_scratch_of_another_jail_is_closed(jail: OpenJail) -> None:
-    """A jail neither reads nor changes what another one keeps in its temporary files."""
     secret = token()
     with jail.arena.environment() as victim:
         owner = run_in(victim, "plant", text=secret)

@@ -77,7 +77,6 @@ def _link(path: str, target: str) -> None:
 
 
 def main(order: dict[str, Any]) -> int:
-    """Both halves of the attack."""
     enter()
     build(order)
     nodes = [*order["nodes"], *(f"{PCI}/{address}/vendor" for address in order["gpus"].values())]

@@ -27,12 +27,10 @@ Look = Callable[[int, int], object]
 
 
 def end(alias: str) -> None:
-    """The control's child has gone with its process group; wait for that."""
     assert eventually(lambda: not pids_named(alias))
 
 
 def user_namespace(pid: int) -> str:
-    """Which user namespace a process is in."""
     return os.readlink(f"/proc/{pid}/ns/user")
 
 
@@ -52,7 +50,6 @@ def root_of(pid: int) -> tuple[int, int]:
 
 
 def other(fact: Callable[[int], object]) -> Look:
-    """Whether a child differs from its parent in this."""
     return lambda child, parent: fact(child) != fact(parent)
 
 
@@ -75,7 +72,6 @@ CHILDREN: dict[str, tuple[str, dict[str, str], Look]] = {
 @pytest.mark.short("strict-user", "strict-mount")
 @pytest.mark.parametrize("title", CHILDREN)
 def test_no_child_has_other_namespaces_mounts_or_roots(jail: OpenJail, title: str) -> None:
-    """No process of a jail leaves its user namespace, and none of its mounts can be changed."""
     payload, arguments, look = CHILDREN[title]
     child = new_alias()
 
@@ -240,7 +236,6 @@ def test_rare_calls_do_not_reach_the_kernel(jail: OpenJail) -> None:
 
 
 def most_filters(run: Run) -> int:
-    """How many filters hold for a process of a run, as the kernel counts them."""
     found = [0]
     for pid in run.pids():
         with contextlib.suppress(OSError):

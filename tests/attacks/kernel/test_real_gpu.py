@@ -22,14 +22,12 @@ nvidias = pytest.mark.skipif("/dev/nvidia0" not in GRANTED, reason="no GPU of NV
 
 
 def nodes_of_drivers() -> list[str]:
-    """Everything that drivers of GPUs have in /dev."""
     found = {str(path) for name in _NAMES for path in Path("/dev").glob(name)}
     return sorted(path for path in found if stat.S_ISCHR(Path(path).stat().st_mode))
 
 
 @contextlib.contextmanager
 def offered(text: str) -> Iterator[str]:
-    """The handle of a text on the card, in a process that keeps it there."""
     command = [sys.executable, str(HOSTILE / "payloads" / "use_card.py"), text]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None

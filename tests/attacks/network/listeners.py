@@ -32,12 +32,10 @@ class Listener:
 
     @property
     def port(self) -> int:
-        """The port that it is bound to."""
         return int(self.socket.getsockname()[1])
 
     @property
     def where(self) -> dict[str, Any]:
-        """How a payload is given its address."""
         name = self.socket.getsockname()
         if self.socket.family == socket.AF_UNIX:
             return {"path": f"@{name[1:].decode()}" if isinstance(name, bytes) else name}
@@ -74,7 +72,6 @@ class Listener:
             source.close()
 
     def close(self) -> None:
-        """Stop receiving."""
         self._stopped = True
         self._thread.join()
         self.socket.close()

@@ -31,7 +31,6 @@ _LOCAL = {"family": socket.AF_UNIX, "kind": socket.SOCK_STREAM}
 
 @contextlib.contextmanager
 def with_loopback(arena: Arena, port: int = 0) -> Iterator[tuple[Any, int]]:
-    """A jail whose own loopback device works, and the port on which it listens there."""
     with arena.environment({"network": "loopback"}) as env:
         message = token()
         run = run_in(env, "listen", port=port, message=message)

@@ -78,7 +78,6 @@ def test_addresses_of_the_host_are_not_told(jail: OpenJail) -> None:
 
 
 def test_events_of_the_hosts_devices_are_not_told(jail: OpenJail) -> None:
-    """The socket for them is there, since games die without; the kernel sends a jail none."""
     mark = token().upper()
     with _device_events(mark) as impossible:
         jail.attack(
@@ -154,7 +153,6 @@ def test_vsock_does_not_get_out(jail: OpenJail) -> None:
 def test_socket_families_are_closed(
     jail: OpenJail, title: str, family: int, kind: int, protocol: int, name: str
 ) -> None:
-    """Rare socket families are ways into the kernel; a jail can make none of them."""
     jail.attack(
         f"socket: {title}",
         "socket_of_family",
@@ -167,7 +165,6 @@ def test_socket_families_are_closed(
 
 
 def without_family(family: int, kind: int = socket.SOCK_STREAM, protocol: int = 0) -> str:
-    """Why this kernel gives this user no such socket, or nothing if it does."""
     try:
         socket.socket(family, kind, protocol).close()
     except OSError as error:
@@ -176,7 +173,6 @@ def without_family(family: int, kind: int = socket.SOCK_STREAM, protocol: int = 
 
 
 def has_socket(run: Run, name: str) -> bool:
-    """Whether a process of the run holds a socket of a protocol, as /proc shows it from here."""
     found = []
     for pid in run.pids():
         with contextlib.suppress(OSError):  # it may end just now

@@ -45,7 +45,6 @@ def run_folder() -> Path:
 
 
 def send_to_an_abstract_socket(jail: OpenJail, title: str, payload: str) -> None:
-    """Attack a socket that has a name and no file."""
     kind = socket.SOCK_STREAM if payload == "unix_stream" else socket.SOCK_DGRAM
     with listening(socket.AF_UNIX, kind, f"\0envhub-{token()}") as listener:
         sends(jail, title, payload, listener)

@@ -49,7 +49,6 @@ print("the end", flush=True)
     ],
 )
 def test_terminal_is_out_of_reach(arena: Arena, title: str, payload: str) -> None:
-    """Neither input nor output appears in the terminal that the client was started from."""
     needs_root = payload == "type_into_terminal" and not legacy_tiocsti()
     impossible = "dev.tty.legacy_tiocsti is 0" if needs_root and USER != "root" else ""
     text = token()
@@ -70,7 +69,6 @@ def legacy_tiocsti() -> bool:
 
 
 def in_terminal(arena: Arena, place: str, payload: str, text: str) -> str:
-    """All that a new terminal shows while a client attacks in it."""
     words = json.dumps([place, str(HOSTILE), payload, {"text": text}, arena.profile])
     root = str(Path(__file__).parents[3])
     pid, screen = pty.fork()

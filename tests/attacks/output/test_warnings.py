@@ -49,7 +49,6 @@ class Flooder(Plain):
 
 
 def told_by(make: Callable[[], Any]) -> list[warnings.WarningMessage]:
-    """All that a caller is warned of, who wants to see everything."""
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         # of what earlier tests left open, whenever the collector comes upon it

@@ -27,21 +27,18 @@ _FETCH = "import sys, urllib.request; urllib.request.urlopen(sys.argv[1]).read()
 
 
 def header(name: str, size: int) -> bytes:
-    """One of a file."""
     member = tarfile.TarInfo(name)
     member.size = size
     return member.tobuf(tarfile.GNU_FORMAT)
 
 
 def archived(folder: Path, data: bytes) -> Path:
-    """A source distribution of these bytes."""
     path = folder / "x-1.0.tar.gz"
     path.write_bytes(gzip.compress(data))
     return path
 
 
 def fetched(archive: Path) -> Path:
-    """What is made of it."""
     place = archive.parent / "place"
     (place / "tree").mkdir(parents=True)
     digest = hashlib.sha256(archive.read_bytes()).hexdigest()

@@ -70,7 +70,6 @@ def control(folder: Path, files: dict[str, str]) -> Path:
 
 
 def building(folder: Path, files: dict[str, str]) -> subprocess.Popen[bytes]:
-    """Build them in a plain interpreter; the wheel comes to lie in the folder."""
     folder.mkdir()
     for name, text in files.items():
         (folder / name).write_text(text)

@@ -43,7 +43,6 @@ def hooked(repository: GitRepository, program: Path) -> list[str]:
 
 
 def filtered(repository: GitRepository, program: Path) -> list[str]:
-    """Git has it make what is committed of what lies in the folder."""
     repository.git("config", "filter.mine.clean", str(program))
     (repository.folder / ".gitattributes").write_text("*.py filter=mine\n")
     os.utime(repository.folder / "env.py", (0, 0))

@@ -19,7 +19,6 @@ FAMILY = "Copies of what is shared"
 
 
 def fill(place: Path) -> Path:
-    """A folder for each way to change one, and files in it."""
     for way in WAYS:
         for name in ("file", "deeper/file"):
             path = place / way / name

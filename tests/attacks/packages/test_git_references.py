@@ -81,7 +81,6 @@ def plain_git(*arguments: str) -> subprocess.CompletedProcess[bytes]:
 
 
 def setting(text: str) -> None:
-    """One of this user's own settings."""
     with Path(os.environ["HOME"], ".gitconfig").open("a") as file:
         file.write(text)
 

@@ -39,7 +39,6 @@ def canary(home: Path, name: str) -> Path:
 
 
 def trap(home: Path, name: str) -> str:
-    """The source of a trap."""
     return _TRAP.format(name=name, canary=os.fsencode(canary(home, name)))
 
 
@@ -101,7 +100,6 @@ def _with_trap(text: str, source: str) -> str:
 
 
 def use_unprotected(folder: Path, place: Path) -> None:
-    """The control: what the same packages do in a virtual environment of their own."""
     major, minor = sys.version_info[:2]
     library = place / f"lib/python{major}.{minor}"
     library.mkdir(parents=True)

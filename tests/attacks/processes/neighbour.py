@@ -31,13 +31,11 @@ class Neighbour:
     path: str
 
     def state(self) -> dict[str, Any]:
-        """``text``, what its memory holds now, ``signals`` and ``broadcasts`` that have come."""
         return dict(run_in(self.env, "be_victim", secret=None).value)
 
 
 @contextmanager
 def neighbour(arena: Arena, secret: str) -> Iterator[Neighbour]:
-    """Another jail, of the same server."""
     with arena.environment() as env:
         run = run_in(env, "be_victim", secret=secret)
         assert run.value, run.error
@@ -65,11 +63,9 @@ class Pair:
 
     @property
     def secret(self) -> str:
-        """What both hold."""
         return self.outside.secret
 
     def written(self, run: Run) -> bool:
-        """Whether the word of ``ptrace_poke`` stands in its memory."""
         return "attacked" in self.of(run).state()["text"]
 
     def signal(

@@ -20,14 +20,12 @@ FAMILY = "Other jails"
 
 @pytest.fixture(scope="module")
 def other(lasting: LastingJail) -> Iterator[Neighbour]:
-    """Another jail than the one that attacks."""
     with neighbour(Arena(lasting.profile, FAMILY), token()) as made:
         yield made
 
 
 @pytest.fixture
 def pair(other: Neighbour) -> Iterator[Pair]:
-    """A process of the caller's and another jail, which hold one secret."""
     with victim(other.secret) as outside:
         yield Pair(outside, other)
 

@@ -80,8 +80,6 @@ def lives(alias: str, patience_s: float = 1.0) -> bool:
 
 
 def kill_group(alias: str) -> None:
-    """End a session that a payload has opened, all of it at once."""
-
     def gone() -> bool:
         found = pids_named(alias)
         for pid in found:  # again and again: one that keeps forking is another one by now

@@ -20,7 +20,6 @@ _ADD_USER_KEYRING, _INVALIDATE = -4, 21
 
 @pytest.fixture
 def hub_token(home: Path, other_cache: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A token in the client's environment, and so in its memory, when a worker server starts."""
     made = f"hf_canary_{token()}"
     monkeypatch.setenv("HF_TOKEN", made)
     use = PROCESS.acquire(other_cache / "snapshots")

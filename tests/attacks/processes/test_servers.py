@@ -56,7 +56,6 @@ def test_a_client_runs_nothing_in_a_zygote_by_the_variables_that_it_is_started_w
 
 
 def watchers(run: Run) -> list[int]:
-    """The pids between this process and the one that runs the payload."""
     [runner] = run.pids()
     found: list[int] = []
     for process in psutil.Process(runner).parents():
@@ -67,7 +66,6 @@ def watchers(run: Run) -> list[int]:
 
 
 def stopped(pids: list[int]) -> list[int]:
-    """Those of the processes that have been stopped or ended."""
     bad = (psutil.STATUS_STOPPED, psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
     return [pid for pid in pids if psutil.Process(pid).status() in bad]
 

@@ -65,7 +65,6 @@ WORD = int.from_bytes(b"attacked", "little")
 
 @contextmanager
 def victim(secret: str) -> Iterator[Victim]:
-    """A victim that holds ``secret``."""
     process = subprocess.Popen(
         [sys.executable, "-I", "-S", __file__, secret],
         stdin=subprocess.PIPE,
@@ -82,7 +81,6 @@ def victim(secret: str) -> Iterator[Victim]:
 
 
 def main(secret: str) -> None:
-    """Be a victim."""
     ctypes.CDLL(None).prctl(_PR_SET_PTRACER, ctypes.c_ulong(-1), 0, 0, 0)
     buffer = ctypes.create_string_buffer(secret.encode())
     file = os.memfd_create("secret")

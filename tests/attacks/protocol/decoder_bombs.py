@@ -30,23 +30,19 @@ Frames = list[Buffer]
 
 
 def array32(count: int, content: bytes) -> bytes:
-    """A msgpack array that claims a number of elements."""
     return b"\xdd" + struct.pack(">I", count) + content
 
 
 def map32(count: int, content: bytes) -> bytes:
-    """A msgpack map that claims a number of pairs."""
     return b"\xdf" + struct.pack(">I", count) + content
 
 
 def extension(code: int, payload: bytes) -> bytes:
-    """A packed extension."""
     content: bytes = msgpack.packb(ext(code, payload))
     return content
 
 
 def many(token: bytes, count: int) -> Frames:
-    """An array of the same token, over and over."""
     return message(array32(count, token * count))
 
 
@@ -148,7 +144,6 @@ BOMBS = REFUSED | ACCEPTED
 
 
 def main() -> None:
-    """Decodes each bomb in a fork, under the kernel's limits, and reports."""
     plain = sys.argv[1:] == ["plain"]
     for name in list(BOMBS)[: 1 if plain else None]:
         frames = BOMBS[name]()
@@ -163,7 +158,6 @@ def main() -> None:
 
 
 def status_bytes(field: str) -> int:
-    """A figure of this process's memory, as the kernel has it."""
     with open("/proc/self/status") as file:
         line = next(line for line in file if line.startswith(field))
     return int(line.split()[1]) * 1024

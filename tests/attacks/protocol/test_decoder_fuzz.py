@@ -50,7 +50,6 @@ FRAMES = [bytes(frame) for frame in encode(SAMPLE)]
 
 
 def attempt(frames: list[Buffer]) -> None:
-    """Decodes; whatever is not decoded must be refused in the one way there is."""
     try:
         value = decode(frames)
     except RemoteProtocolError:
@@ -127,7 +126,6 @@ def test_hostile_documents_are_decoded_or_refused(
 
 
 def explode(*arguments: str) -> dict[str, dict[str, Any]]:
-    """Decodes the bombs in a process of limited memory and CPU time; what it says of each."""
     run = subprocess.run(
         [sys.executable, "-m", decoder_bombs.__name__, *arguments],
         cwd=ROOT,

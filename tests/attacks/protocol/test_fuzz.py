@@ -42,7 +42,6 @@ KINDS = {
 
 @pytest.fixture(scope="module")
 def corpus(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of what real workers say."""
     file = tmp_path_factory.mktemp("traffic") / "recording"
     run = [sys.executable, "-m", traffic.__name__, str(file)]
     subprocess.run(run, cwd=ROOT, check=True, timeout=280)
@@ -102,7 +101,6 @@ Recorded = tuple[list[traffic.Frames], list[m.Message]]
 
 @pytest.fixture(scope="module")
 def recorded(corpus: Path) -> Recorded:
-    """The recording, and the same decoded."""
     found: list[traffic.Frames] = pickle.loads(corpus.read_bytes())
     return found, child.decoded(found)
 

@@ -32,7 +32,6 @@ SLOT = 1 << 16
 
 @pytest.fixture
 def observations() -> Iterator[ObservationSlab]:
-    """The slab of boolean observations of two sub-environments."""
     space = spaces.Box(0, 1, (8,), np.bool_)
     layout = slabs.observation_layout(space, 2, 1)
     assert layout is not None
@@ -43,7 +42,6 @@ def observations() -> Iterator[ObservationSlab]:
 
 @pytest.fixture
 def shard(observations: ObservationSlab) -> Iterator[LaneShard]:
-    """The client's side of the shard that has both of them."""
     layout = slabs.layout_of(spaces.Box(-1, 1, (2,)), 2)
     assert layout is not None
     made = LaneShard(layout, observations.fd)
@@ -228,7 +226,6 @@ def test_columns_without_a_schema_are_refused(shard: LaneShard) -> None:
 def test_bytes_that_are_no_booleans_become_booleans(
     shard: LaneShard, observations: ObservationSlab
 ) -> None:
-    """A flag or a boolean observation of 2 would be neither true nor false: it is made true."""
     os.pwrite(observations.fd, b"\x02" * 4, observations.layout.results + 16)
     os.pwrite(observations.fd, b"\x02" * 16, 0)
     _, terminations, truncations = observations.results()
@@ -268,7 +265,6 @@ def test_what_the_caller_has_is_not_rewritten(
 def test_the_answer_to_a_step_is_copied_before_it_is_looked_at(
     size: int | None, spoiled: bytes, refusal: str
 ) -> None:
-    """In a slot of its own size, too; the control is read, and is not rewritten afterwards."""
     layout = slabs.message_layout(spaces.Box(-1, 1, (2,)), 2)
     assert layout is not None
     ring = SlotRing(1, SLOT, SLOT)

@@ -34,7 +34,6 @@ def figure(path: str, name: str) -> int:
 
 
 def terminals(run: Run) -> int:
-    """Pseudo terminals that a run's processes hold, by their masters."""
     links = [
         os.readlink(f"/proc/{pid}/fd/{fd}")
         for pid in run.pids()
@@ -44,7 +43,6 @@ def terminals(run: Run) -> int:
 
 
 def in_pipes(run: Run) -> int:
-    """What waits in the pipes of a run."""
     held = {}
     for pid in run.pids():
         with contextlib.suppress(OSError):
@@ -56,7 +54,6 @@ def in_pipes(run: Run) -> int:
 
 
 def waiting(path: str) -> int:
-    """What waits in one pipe."""
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         words = array("i", [0])

@@ -209,7 +209,6 @@ def remove(kind: str, left: list[Any]) -> None:
 
 
 def test_memory_bomb_does_not_hurt_the_neighbours(arena: Arena) -> None:
-    """The jail that takes too much dies with a clear reason; another one steps on."""
     with arena.environment() as other:
         other.reset()
         with (
@@ -286,7 +285,6 @@ def test_disk_cannot_be_filled(
 
 
 def test_processor_time_runs_out(strict: Arena) -> None:
-    """A process that burns more than its seconds is killed, ignore the warning as it may."""
     strict.attack(
         "burn processor time",
         "spin",
@@ -297,7 +295,6 @@ def test_processor_time_runs_out(strict: Arena) -> None:
 
 
 def spent(pid: int) -> float:
-    """Seconds of the processor's time that a process has had."""
     with contextlib.suppress(psutil.NoSuchProcess):
         times = psutil.Process(pid).cpu_times()
         return float(times.user + times.system)
@@ -329,7 +326,6 @@ def test_output_flood_is_dropped(arena: Arena) -> None:
 
 
 def test_bombs_leave_the_host_usable(arena: Arena) -> None:
-    """After a fork bomb and its end nothing of it is left, and the next jail starts."""
     alias = new_alias()
     with arena.environment(limits={"processes": PROCESSES}) as env:
         call(env, Run(alias, True), "fork_bomb", {"count": FORKS})

@@ -25,7 +25,6 @@ MIB = 1 << 20
 
 @pytest.fixture
 def granted(home: Path) -> Path:
-    """A folder of the caller's that jails may read."""
     folder = home / "granted"
     folder.mkdir()
     (folder / "model.bin").write_text("weights")

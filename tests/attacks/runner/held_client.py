@@ -52,7 +52,6 @@ def suffer(repository: str, order: dict[str, Any], act: str) -> None:
 
 
 def main(repository: str, order: dict[str, Any]) -> int:
-    """All acts, one after the other."""
     neighbours = make_env(repository, policy=order["policy"])
     neighbours.env.reset()
     for act in order["acts"]:

@@ -74,7 +74,6 @@ def inherited(home: Path, other_cache: Path) -> Iterator[str]:
 
 @pytest.mark.short("strict")
 def test_open_files_are_not_inherited(arena: Arena, inherited: str) -> None:
-    """What the client has open, even for children to inherit, no jail is born with."""
     alias = new_alias()
     process = start_control("inherited_descriptors", {}, alias, close_fds=False)
     answer, _ = process.communicate(b"\n")
@@ -125,7 +124,6 @@ def descriptors(pid: int) -> list[int]:
 
 
 def test_every_descriptor_of_a_jail_is_known(arena: Arena, home: Path) -> None:
-    """There is none but these, and only they share them that are said to; asked of the kernel."""
     repository, alias = write_environment(home / "keeper", KEEPER), new_alias()
     with make_env(repository, timeouts=TIMEOUTS, **arena.place({})) as suites:
         env = suites.env
@@ -152,7 +150,6 @@ def test_every_descriptor_of_a_jail_is_known(arena: Arena, home: Path) -> None:
 
 
 def open_file(pid: int, fd: int) -> str:
-    """What kind of file it is; the path of one that has one."""
     return os.readlink(f"/proc/{pid}/fd/{fd}").partition(":")[0]
 
 
@@ -241,5 +238,4 @@ def make_noise(env: Any, noise: bytes, run: Run) -> None:
 
 
 def servers() -> list[int]:
-    """This process and the worker servers."""
     return [os.getpid(), *(process.pid for process in psutil.Process().children())]

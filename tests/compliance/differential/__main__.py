@@ -27,7 +27,6 @@ from tests.compliance.theirs.through_sandbox import options_of
 
 
 def main() -> int:
-    """Runs cases until the time is over; prints what differs."""
     parser = argparse.ArgumentParser(prog="python -m tests.compliance.differential")
     parser.add_argument("--kind", choices=KINDS, default="calls")
     parser.add_argument("--seconds", type=float, default=60.0)

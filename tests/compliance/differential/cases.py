@@ -47,7 +47,6 @@ class Case:
 
 
 def case(number: int) -> Case:
-    """The case of a number: the same in each run."""
     draw = Random(number)
     loose, count = draw.random() < 0.4, draw.randrange(1, 6)
     observed, acted = space(draw, loose=loose, least=0), space(draw, loose=loose)
@@ -98,7 +97,6 @@ def _call(draw: Random, reference: SyncVectorEnv) -> Call:
 
 
 def listed(actions: Any) -> Any:
-    """The same actions in lists of Python's numbers."""
     if isinstance(actions, dict):
         return {key: listed(item) for key, item in actions.items()}
     if isinstance(actions, tuple) and not hasattr(actions, "_fields"):

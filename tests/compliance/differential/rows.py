@@ -28,7 +28,6 @@ _AHEAD = 3
 
 
 def case(number: int) -> Case:
-    """The case of a number: the same in each run."""
     draw = Random(f"rows {number}")
     loose, count = draw.random() < 0.3, draw.randrange(1, 6)
     observed, acted = space(draw, loose=loose, least=0), flat_space(draw)
@@ -66,7 +65,6 @@ class Slice:
 
 
 def difference(drawn: Case, number: int, further: dict[str, Any] | None = None) -> str | None:
-    """The first difference in words, or None if there is none in so many calls."""
     with warnings.catch_warnings(), by_value():
         warnings.simplefilter("ignore")
         options = {**drawn.options, **(further or {})}
@@ -262,7 +260,6 @@ def _same_failure(expected: Any, actual: Any) -> bool:
 
 
 def _member(single: gym.Space[Any], batched: Any, place: int) -> Any:
-    """One observation of a batch, of any space."""
     if isinstance(single, spaces.Dict):
         return {key: _member(sub, batched[key], place) for key, sub in single.spaces.items()}
     if isinstance(single, spaces.Tuple):

@@ -129,7 +129,6 @@ class Scripted(gym.Env[Any, Any]):
         return said((args, kwargs)), self.value(self.draw.choice(KINDS), 0)
 
     def keyed(self) -> Any:
-        """A mapping whose keys are of any class, the same each time."""
         keys = random.Random(self.number).sample(ANY_KEYS, 3)
         return {key: {"inner": {key: self.number}} for key in keys}
 
@@ -227,7 +226,6 @@ def refilled(old: Any, new: Any) -> Any:
 
 
 def said(value: Any) -> str:
-    """A value in words: its classes, dtypes and numbers."""
     if isinstance(value, dict):
         inner = ", ".join(f"{key!r}: {said(item)}" for key, item in value.items())
     elif isinstance(value, (list, tuple)):

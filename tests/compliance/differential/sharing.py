@@ -43,7 +43,6 @@ class Case:
 
 
 def case(number: int) -> Case:
-    """The case of a number: the same in each run."""
     draw = Random(f"sharing {number}")
     kwargs = {
         "kinds": draw.sample(KINDS, draw.choice([0, 1, 1, 2])),

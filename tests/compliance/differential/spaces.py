@@ -33,7 +33,6 @@ def space(draw: Random, *, loose: bool, depth: int = 0, least: int = 1) -> Space
 
 
 def flat_space(draw: Random) -> Space:
-    """A random space whose batch is an array."""
     return _ONE[draw.choice(_FLAT)](draw)
 
 

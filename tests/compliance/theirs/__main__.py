@@ -29,7 +29,6 @@ PLUGIN = "through_sandbox"
 
 
 def main() -> int:
-    """Runs their tests once for each variant."""
     parser = argparse.ArgumentParser(prog="python -m tests.compliance.theirs", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("path", nargs="+", type=Path, help="files or folders of tests")

@@ -84,7 +84,6 @@ def by_value() -> Iterator[None]:
 
 
 def options_of(variant: str) -> dict[str, Any]:
-    """What ``make_env`` is told for a variant."""
     options = dict(VARIANTS[variant])
     if variant == "tcp":
         server = json.loads(os.environ[SERVER])
@@ -138,7 +137,6 @@ class SingleMaker:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--variant``."""
     parser.addoption("--variant", choices=VARIANTS, default="plain", help="how it is sandboxed")
 
 

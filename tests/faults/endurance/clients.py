@@ -40,7 +40,6 @@ MEMORY = {"limits": {"memory_bytes": 1 << 30}}
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run what was asked for; prints one JSON document."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--in-a-row", type=int, default=1000)
     parser.add_argument("--client", nargs=2, help=argparse.SUPPRESS)
@@ -109,7 +108,6 @@ class Server:
         assert eventually(lambda: worker(*asks).returncode == 0)
 
     def sandbox(self) -> RemoteSandbox:
-        """The way to it, for this process."""
         return self._listens.sandbox(retry_s=_RETRY_S)
 
     def short(self) -> None:
@@ -150,7 +148,6 @@ class Server:
 
 @contextlib.contextmanager
 def serving(folder: Path) -> Iterator[Server]:
-    """A server with a temporary folder of its own, which ends with this."""
     place = folder / "place"
     place.mkdir(mode=0o711)
     folder.chmod(0o711)

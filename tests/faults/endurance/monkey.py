@@ -93,7 +93,6 @@ class Subject:
         """Deaths that a reset may meet after the first: of workers that had answered by then."""
 
     def doubted(self) -> None:
-        """One of its processes was killed: from now on it may turn out to be dead."""
         self.doubt = self.doubt or 1
         self.others = len(inside.leases(self.env)) - 1
 
@@ -148,7 +147,6 @@ class Monkey:
         self.mismatches: list[str] = []
 
     def once(self) -> None:
-        """One operation on whatever it comes upon."""
         self.counts["operations"] += 1
         if not self._subjects or self._rng.random() * 40 * len(self._subjects) < self._most:
             self._open()
@@ -234,7 +232,6 @@ class Monkey:
         self._compare(got, subject.model.reset(seed=seed))
 
     def _reset_some(self, subject: Subject) -> None:
-        """Those of a mask."""
         mask = self._rng.random(subject.n_envs) < 0.5
         mask[self._rng.integers(subject.n_envs)] = True
         seed = int(self._rng.integers(2**31))
@@ -288,7 +285,6 @@ class Monkey:
             raise Mismatch(name)
 
     def _kill(self, subject: Subject) -> None:
-        """One of its processes, or all."""
         pids = self._pids(subject)
         if pids and self._rng.random() < 0.8:
             pids = [int(self._rng.choice(pids))]
@@ -382,14 +378,12 @@ class Monkey:
     # --- what has grown --------------------------------------------------------------------
 
     def rest(self) -> None:
-        """Close everything."""
         for subject in self._subjects:
             subject.suites.close()
         self._subjects.clear()
         gc.collect()
 
     def look(self, place: Place, before: Mapping[str, float] | None = None) -> dict[str, float]:
-        """What there is beside one new environment, once all else has ended."""
         self.rest()
         subject = Subject(np.random.default_rng(0), self._sandbox)
         with subject.suites:
@@ -417,7 +411,6 @@ class Place:
         """Further servers of a fleet, which are killed and started."""
 
     def sandbox(self) -> Any:
-        """What ``make_env`` is given."""
         one = self._server.sandbox() if self._server else "process"
         return [one, *(server.sandbox() for server in self.others)] if self.others else one
 
@@ -460,7 +453,6 @@ def _place(name: str) -> Iterator[Place]:
 
 
 def run(arguments: argparse.Namespace, name: str) -> dict[str, Any]:
-    """Play in one place; what was done there, and what there was of everything."""
     begun = time.monotonic()
     with _place(name) as place:
         sandbox, many = place.sandbox(), arguments.environments
@@ -521,7 +513,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def passed(found: Mapping[str, Any]) -> bool:
-    """Whether no result differed and nothing has grown."""
     return not found["mismatches"] and not found["grown"]
 
 

@@ -68,7 +68,6 @@ class Row:
 
     @property
     def name(self) -> str:
-        """For test ids."""
         return f"{self.fault}-{self.moment}"
 
 
@@ -163,7 +162,6 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """For test ids and measurements."""
         return f"{self.row.name}-{self.mode}-{self.lane}"
 
 

@@ -45,7 +45,6 @@ def test_fault_is_told_contained_and_cleaned_up(
 
 
 def _try(cell: Cell, neighbour: Neighbour, repository: Path, stack: contextlib.ExitStack) -> float:
-    """Let the fault happen, check everything but what remains; returns the seconds it took."""
     if cell.row.moment in LOADING:
         error, seconds = _caught(lambda: _use(_make(cell, repository)))
         suites = None
@@ -102,7 +101,6 @@ def _limits(fault: str) -> Limits:
 
 
 def _use(suites: Any) -> Any:
-    """The first use of the faulty environment builds all its sub-environments."""
     [tasks] = suites.values()
     first = next(iter(tasks.values()))
     try:

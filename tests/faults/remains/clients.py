@@ -30,7 +30,6 @@ def say(text):
 
 
 def start(folder: Path, body: str) -> subprocess.Popen[str]:
-    """Start a client whose temporary files all lie in ``folder``."""
     inherited = {name: value for name, value in os.environ.items() if name != "TZ"}
     return subprocess.Popen(
         [sys.executable, "-c", _HEAD + textwrap.dedent(body)],
@@ -42,7 +41,6 @@ def start(folder: Path, body: str) -> subprocess.Popen[str]:
 
 
 def line(client: subprocess.Popen[str]) -> str:
-    """The client's next line."""
     assert client.stdout is not None
     return client.stdout.readline().strip()
 
@@ -59,7 +57,6 @@ def is_clean(folder: Path) -> bool:
 
 
 def left(folder: Path) -> list[str]:
-    """What remains of a client that had this folder."""
     found = Traces.of(folder)
     # groups are named after their server, and bear no folder; the fault matrix looks at those
     kinds = ("processes", "files", "sockets", "mounts")

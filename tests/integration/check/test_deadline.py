@@ -102,7 +102,6 @@ def hanging(folder: Path, place: str) -> Path:
 
 
 def hangs_now() -> bool:
-    """Whether there is a process of that name."""
     names = [Path(f"/proc/{pid}/comm") for pid in descendants()]
     return any(name.exists() and name.read_bytes().strip() == _NAME for name in names)
 

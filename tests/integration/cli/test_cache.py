@@ -231,7 +231,6 @@ def gc(
 
 
 def left_behind(temporary: Path) -> Path:
-    """The folder of a container whose client has ended."""
     folder = temporary / "envhub-docker-abcd0123"
     folder.mkdir(mode=0o700)
     (folder / "alive").touch()  # whose lock no process holds

@@ -59,7 +59,6 @@ def make_env(n_envs=1, use_async_envs=False, forged={_NAME!r}):
 
 
 def repository(folder: Path, *, ends: bool = False, fails: bool = False) -> Path:
-    """A repository that writes commands wherever it may write."""
     text = f"ENDS, FAILS = {ends}, {fails}\n{_ENV}"
     write_repository(folder, text, README__md=f"# {_NAME}\nlicense: {_NAME}")
     for one in FORGED:
@@ -81,7 +80,6 @@ def place(tmp_path: Path) -> Path:
 
 
 def crashed(place: Path) -> Path:
-    """A crash bundle of a hostile repository."""
     policy = {"crash_folder": str(place / "crashes")}
     with make_env(place / "dies", policy=policy) as suites:
         suites.env.reset(seed=0)
@@ -92,7 +90,6 @@ def crashed(place: Path) -> Path:
 
 
 def commands(place: Path) -> list[list[str]]:
-    """Every command that prints something of a repository."""
     lists = place / "list.txt"
     lists.write_text("".join(f"{place / name}\n" for name in ("dies", "fails", "wants")))
     (place / "wrong.txt").write_text(f"{_NAME}\nrepo {_NAME}\n")

@@ -74,8 +74,6 @@ def test_all_missing_layers_are_named_with_their_fixes(monkeypatch: pytest.Monke
 
 
 def fail_with(monkeypatch: pytest.MonkeyPatch, errors: dict[str, Exception]) -> None:
-    """Have ``make_env`` fail for some profiles, and the others not be tried."""
-
     def make_env(folder: str, *, policy: dict[str, Any], sandbox: str) -> Any:
         raise errors.get(policy["profile"], SandboxUnavailableError("not this either"))
 

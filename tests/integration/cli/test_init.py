@@ -18,7 +18,6 @@ PLUGIN = "envhub_sandbox.integrations.pytest_plugin"
 
 
 def run(folder: Path, *command: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run a command there to its end."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
     return subprocess.run(
         command,
@@ -32,7 +31,6 @@ def run(folder: Path, *command: str, **variables: str) -> subprocess.CompletedPr
 
 
 def pytest_run(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    """What an author would run, without what our own tests need."""
     # by its module: what is installed beside a checkout may be of before there was a plugin
     plugins = ("no:envhub", PLUGIN, "no:cacheprovider", "no:xdist", "no:hypothesispytest")
     chosen = [part for name in plugins for part in ("-p", name)]

@@ -39,7 +39,6 @@ def make_env(n_envs=1, use_async_envs=False, render_mode=None):
 
 
 def one_env(folder: Path, step: str, render: str = "return None") -> Path:
-    """A repository whose environment does this in ``step`` and ``render``."""
     return write_repository(folder, _ONE_ENV % (step, render))
 
 
@@ -141,7 +140,6 @@ def test_a_repository_that_does_not_load(tmp_path: Path) -> None:
 
 
 def hostile_names(folder: Path, suite: str, task: str) -> Path:
-    """A repository that calls its suite and its task so."""
     code = _ONE_ENV % (OVER, "return None")
     code += f"""
 def make_env(n_envs=1, use_async_envs=False):
@@ -151,7 +149,6 @@ def make_env(n_envs=1, use_async_envs=False):
 
 
 def test_names_with_control_characters_are_refused(tmp_path: Path) -> None:
-    """A repository that names its tasks in escape sequences does not get to run."""
     done = envhub("run", hostile_names(tmp_path / "evil", "\x1b]0;owned\x07", "\x1b[2J"))
     assert (done.returncode, done.stdout) == (5, "")
     assert "control characters" in done.stderr

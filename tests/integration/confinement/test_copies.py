@@ -85,7 +85,6 @@ def folder() -> Iterator[Path]:
 
 @pytest.fixture
 def packages(folder: Path) -> Path:
-    """What all jails of the spawner share."""
     return close(fill(folder / "packages"))
 
 
@@ -99,7 +98,6 @@ def cell(folder: Path, packages: Path) -> Iterator[Cell]:
 
 
 def outcome(cell: Cell, source: str) -> Any:
-    """The result, or a failure that shows the error."""
     answer = cell.run(source)
     assert "result" in answer, (answer, cell.output)
     return answer["result"]

@@ -37,7 +37,6 @@ from tests.support.repositories import STILL
 
 @pytest.fixture(scope="module")
 def cells() -> Iterator[dict[str, Cell]]:
-    """A jail of each profile, kept for the module."""
     with ExitStack() as stack:
         yield {
             profile: stack.enter_context(

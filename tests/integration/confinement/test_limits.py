@@ -58,7 +58,6 @@ time.sleep(1000)
 
 @contextmanager
 def limited(profile: str, **limits: int) -> Iterator[Cell]:
-    """A cell under ``limits``."""
     confinement = Confinement(profile=profile, limits=Limits(**limits))
     with open_folder() as folder, cell_in(folder, confinement) as cell:
         cell.wait_for(RunnerStarted)

@@ -33,7 +33,6 @@ def make_env(n_envs=1, use_async_envs=False, size=4):
 
 
 def run(arguments: list[str], folder: Path) -> None:
-    """A program in a folder that has what the documents talk about."""
     here = folder / "here"
     shutil.copytree(EXAMPLES / "cartpole", here, dirs_exist_ok=True)
     shutil.copytree(EXAMPLES / "cartpole", here / "my-env")

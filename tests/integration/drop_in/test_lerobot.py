@@ -38,7 +38,6 @@ def policy(batch: dict[str, Any]) -> Any:
 
 @pytest.fixture
 def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A suite of three tasks, whose environment class is a sibling file."""
     swing_up = (sample("lerobot_pendulum") / "env.py").read_text().replace('fps": 20', 'fps": 12.5')
     folder = write_repository(tmp_path / "pendulum_suite", SUITE, swing_up__py=swing_up)
     monkeypatch.syspath_prepend(str(folder))

@@ -91,7 +91,6 @@ def make_env(n_envs=1, use_async_envs=False):
 
 @pytest.fixture(params=_MODES)
 def counters(request: pytest.FixtureRequest) -> Iterator[SandboxVecEnv]:
-    """Three counters in a sandbox, in each autoreset mode."""
     options = {"env_kwargs": {"autoreset_mode": request.param}}
     env = SandboxVecEnv.make(sample("counter"), n_envs=3, **options)
     yield env
@@ -104,7 +103,6 @@ def here() -> DummyVecEnv:
 
 
 def form(value: Any) -> Any:
-    """The value with its classes, to be compared."""
     if isinstance(value, dict):
         return {key: form(one) for key, one in value.items() if key not in _DESCRIBED}
     if isinstance(value, (list, tuple)):
@@ -115,7 +113,6 @@ def form(value: Any) -> Any:
 
 
 def one_of(repository: str) -> DummyVecEnv:
-    """The same environment in this process."""
     names: dict[str, Any] = {}
     exec(repository, names)
     made = names["make_env"](n_envs=2)

@@ -54,7 +54,6 @@ def pendulums() -> Iterator[VectorEnv[Any, Any, Any]]:
 
 
 def rollout(env: VectorEnv[Any, Any, Any], steps: int = 60) -> list[Any]:
-    """Everything that a seeded rollout with seeded actions returns."""
     actions = env.unwrapped.action_space
     actions.seed(5)
     return [env.reset(seed=5), *[env.step(actions.sample()) for _ in range(steps)]]
@@ -91,7 +90,6 @@ def test_dict_info_to_list(mode: str) -> None:
 
 
 def test_numpy_to_torch(pendulums: VectorEnv[Any, Any, Any]) -> None:
-    """NumpyToTorch turns results into equal tensors, and takes tensors as actions."""
     torch = pytest.importorskip("torch")
     pytest.importorskip("array_api_compat")
     results = []
@@ -113,7 +111,6 @@ def test_dict_observations_under_wrappers() -> None:
 
 
 def test_record_video(tmp_path: Path) -> None:
-    """RecordVideo captures the same frames, and its file is a video."""
     pytest.importorskip("moviepy")
     frames = {}
     with make_env(sample("lerobot_pendulum"), n_envs=2) as suites:

@@ -88,7 +88,6 @@ def stays(servers: list[Listening]) -> Listening:
 
 @pytest.fixture
 def serve(tmp_path: Path, client_key: Path) -> Iterator[Callable[..., Listening]]:
-    """Starts a server of the test's own."""
     with ExitStack() as stack:
 
         def start(name: str, *options: str, **more: Any) -> Listening:

@@ -30,7 +30,6 @@ def _is_at(env: Any, server: Listening) -> np.ndarray:
 
 
 def test_its_rows_come_back_elsewhere(rows: Path, stays: Listening, serve: Serve) -> None:
-    """Truncated, and reset with seeds derived of theirs; the others' episodes go on."""
     goes = serve("goes")
     sandbox = [stays.sandbox(), goes.sandbox()]
     options: dict[str, Any] = {"n_envs": 6, "num_workers": 4, "policy": {"restart": "transparent"}}

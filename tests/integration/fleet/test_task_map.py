@@ -12,7 +12,6 @@ from tests.support.samples import sample
 
 
 def _return_of(suite: str, task: Any, env: Any) -> float:
-    """What some steps of a task come to."""
     env.reset(seed=1)
     actions = env.action_space
     actions.seed(2)

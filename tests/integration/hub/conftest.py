@@ -21,8 +21,6 @@ def repository(stub_hub: StubHub) -> StubRepository:
 
 @pytest.fixture
 def get(stub_hub: StubHub, hub_cache: Path, repository: StubRepository) -> Fetch:
-    """``fetch`` from the stub, with caches of this test only."""
-
     def run(text: str = "models/org/repo", **rest: Any) -> Snapshot:
         arguments = {"hub_cache_dir": hub_cache, "token": False, "endpoint": stub_hub.endpoint}
         return fetch(HubRef.parse(text), **{**arguments, **rest})

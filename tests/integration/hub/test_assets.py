@@ -52,8 +52,6 @@ def own(stub_hub: StubHub) -> StubRepository:
 
 @pytest.fixture
 def make(stub_hub: StubHub, hub_cache: Path, own: StubRepository) -> Make:
-    """``make_env`` of a repository of the stub."""
-
     def run(ref: str = f"org/repo@{StubRepository({}).commit}", **options: Any) -> Any:
         given = {"endpoint": stub_hub.endpoint, "hub_cache_dir": hub_cache, "token": False}
         return make_env(ref, **{**given, **options})
@@ -82,7 +80,6 @@ def test_downloads_of_the_own_id_return_the_pinned_files(
 def test_other_types_of_repository_find_themselves(
     make: Make, stub_hub: StubHub, kind: str
 ) -> None:
-    """A space finds itself as a space, and a dataset as a dataset."""
     code = ENV.replace("snapshot_download(OWN)", f"snapshot_download('org/x', repo_type={kind!r})")
     stub_hub.add("org/x", {"env.py": code}, kind)
     with make(f"{kind}s/org/x") as suites:

@@ -38,7 +38,6 @@ if AGAIN:
 
 
 def failure(get: Fetch, text: str = "models/org/repo", **rest: Any) -> RepositoryUnavailableError:
-    """The error of a fetch, which names the reference and keeps its cause."""
     with pytest.raises(RepositoryUnavailableError) as caught:
         get(text, **rest)
     assert text in str(caught.value)
@@ -267,7 +266,6 @@ def test_password_in_the_endpoint_is_not_shown(
 def test_an_interrupt_waits_for_no_download(
     stub_hub: StubHub, hub_cache: Path, *, again: bool
 ) -> None:
-    """Nor does the end of the process; and the next ``make_env`` can have it all."""
     files = {f"assets/{number}": str(number) for number in range(20)}
     stub_hub.add("org/repo", {"env.py": STILL, **files})
     stub_hub.fail("(GET|HEAD) /org/repo/resolve/.*/assets/7$", stall=True, times=1)

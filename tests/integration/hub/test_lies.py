@@ -31,7 +31,6 @@ GOOD = b"def make_env(n_envs=1, use_async_envs=False): ...\n"
 
 @pytest.fixture
 def get(get: Fetch, repository: StubRepository) -> Fetch:
-    """``fetch`` at the repository's commit."""
     return lambda **rest: get(f"models/org/repo@{repository.commit}", **rest)
 
 
@@ -56,8 +55,6 @@ def requests_for_files(stub_hub: StubHub) -> list[str]:
 def test_other_content_than_the_pinned_commit_is_refused(
     repository: StubRepository, get: Fetch, snapshot_store: Path, where: str, path: str, lie: Any
 ) -> None:
-    """Other bytes of any length, another size or blob id, a connection that ends half way: there is
-    an error, and nothing in the store; then the truth is fetched."""
     lies = getattr(repository, where)
     lies |= {path} if lie is None else {path: lie}
     with pytest.raises((SnapshotIntegrityError, RepositoryUnavailableError)) as caught:
@@ -71,7 +68,6 @@ def test_other_content_than_the_pinned_commit_is_refused(
 
 
 def test_other_commit_than_the_pinned_one_is_refused(stub_hub: StubHub, get: Fetch) -> None:
-    """A server that resolves a full commit to another one is not followed."""
     pinned = get().commit
     repository = stub_hub.repositories["model", "org/repo"]
     repository.commit, repository.refs = "b" * 40, {"a" * 40}
@@ -154,7 +150,6 @@ def test_repository_over_a_limit_is_refused_before_the_download(
 
 
 def test_endless_listing_is_left_at_the_limit(stub_hub: StubHub, get: Fetch) -> None:
-    """A listing in pages is read only until it is too long."""
     stub_hub.add("org/repo", {"env.py": GOOD, **{f"f{n}": b"" for n in range(50)}})
     stub_hub.page_size = 2
     with pytest.raises(SnapshotTooLargeError, match="max_files=5"):

@@ -29,8 +29,6 @@ Fetch = Callable[..., Snapshot]
 
 @pytest.fixture
 def get(olah: OlahServer, hub_cache: Path) -> Fetch:
-    """``fetch`` from olah, with caches of this test only."""
-
     def run(text: str) -> Snapshot:
         return fetch(
             HubRef.parse(text), hub_cache_dir=hub_cache, token=False, endpoint=olah.endpoint
@@ -40,12 +38,10 @@ def get(olah: OlahServer, hub_cache: Path) -> Fetch:
 
 
 def make(olah: OlahServer, name: str, repo_type: str = "model") -> GitRepository:
-    """A repository of its own for one test."""
     return olah.repository(f"org/{name}", repo_type)
 
 
 def contents(snapshot: Snapshot) -> dict[str, bytes]:
-    """What lies on disk below the root."""
     return {
         str(path.relative_to(snapshot.root)): path.read_bytes()
         for path in snapshot.root.rglob("*")
@@ -77,7 +73,6 @@ def test_whole_repository_arrives_verified(olah: OlahServer, get: Fetch) -> None
 
 
 def test_branch_tag_and_short_commit_name_the_full_commit(olah: OlahServer, get: Fetch) -> None:
-    """Whatever names a commit, the snapshot says which one it is."""
     repository = make(olah, "names")
     first = repository.commit({"env.py": "1"}, tag="v1")
     second = repository.commit({"env.py": "2"})
@@ -166,7 +161,6 @@ def test_missing_everywhere_mentions_model_and_space(olah: OlahServer, get: Fetc
 
 
 def test_threads_share_one_snapshot(olah: OlahServer, get: Fetch) -> None:
-    """Concurrent fetches of the same commit all succeed and leave one copy."""
     make(olah, "threads").commit(FILES)
     with ThreadPoolExecutor(6) as pool:
         snapshots = list(pool.map(get, ["org/threads"] * 6))

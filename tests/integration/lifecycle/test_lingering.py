@@ -33,12 +33,10 @@ def _known() -> None:
 
 
 def started() -> set[int]:
-    """Pids of everything below this process that a test has started."""
     return descendants() - _BEFORE
 
 
 def used(server_idle_s: float | None, **options: object) -> None:
-    """One environment, from its making to its end."""
     timeouts = {"server_idle_s": server_idle_s}
     with make_env(sample("counter"), n_envs=2, timeouts=timeouts, **options) as suites:  # type: ignore[arg-type]
         suites.env.reset(seed=0)

@@ -61,7 +61,6 @@ Tasks = list[Any]
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
-    """A suite of tasks that are built when they are used."""
     return write_repository(tmp_path / "repository", STILL + SUITE)
 
 

@@ -37,14 +37,12 @@ MOTOR = "def turn(angle):\n    raise ZeroDivisionError('stuck')\n"
 
 
 def repository(folder: Path, text: str = ENV) -> Path:
-    """A repository with a part that breaks."""
     (folder / "mine" / "parts").mkdir(parents=True)
     (folder / "mine" / "parts" / "motor.py").write_text(MOTOR)
     return write_repository(folder / "mine", text)
 
 
 def failure(reference: str, *, at: str, **options: Any) -> EnvHubError:
-    """What is raised in loading or in a step."""
     broken = {"broken": True} if at == "make_env" else None
     with pytest.raises(ZeroDivisionError, match="stuck") as caught:
         play(reference, env_kwargs=broken, **options)

@@ -23,7 +23,6 @@ from tests.support.samples import make_env_of, reference, sample
 
 
 def roll(env: VectorEnv[Any, Any, Any], steps: int = 5) -> Any:
-    """Reset with a seed, step with seeded actions, return the last result."""
     env.reset(seed=1)
     env.action_space.seed(1)
     return [env.step(env.action_space.sample()) for _ in range(steps)][-1]
@@ -130,7 +129,6 @@ class TestLayouts:
     """Where the entry point is, and what it is."""
 
     def test_src_layout(self) -> None:
-        """A package under ``src/`` is importable from ``env.py``."""
         with make_env(sample("src_layout"), n_envs=2) as suites:
             assert roll(suites.env)[0].shape == (2, 1)
 

@@ -58,7 +58,6 @@ def test_argparse_that_leaves_shows_its_usage(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def env(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """An environment that runs what it is given."""
     folder = write_repository(tmp_path_factory.mktemp("runs") / "repo", RUNS)
     with make_env(str(folder), policy={"restart": "on_reset"}) as suites:
         yield suites.env

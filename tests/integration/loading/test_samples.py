@@ -20,7 +20,6 @@ from tests.support.samples import make_env_of, reference, sample
     [("lunar_lander", (400, 600, 3)), ("half_cheetah", (48, 64, 3)), ("pusht", (680, 680, 3))],
 )
 def test_frames_are_the_reference_frames(name: str, shape: tuple[int, ...]) -> None:
-    """``render()`` gives one uint8 frame per sub-environment, equal to the in-process one."""
     expected = reference(name, 2)
     with make_env(sample(name), n_envs=2) as suites:
         for env in (expected, suites.env):
@@ -70,7 +69,6 @@ class TestLeRobotDocs:
     """The two examples of LeRobot's EnvHub documentation, used as it uses them."""
 
     def test_single_task(self) -> None:
-        """The page's own loop: random actions until every environment is done."""
         envs_dict = make_env(sample("lerobot_docs_single"), n_envs=4, use_async_envs=True)
         suite_name = next(iter(envs_dict))
         env = envs_dict[suite_name][0]
@@ -86,7 +84,6 @@ class TestLeRobotDocs:
         envs_dict.close()
 
     def test_multi_task(self) -> None:
-        """Suites and tasks keep their names and order, and each task is its own environment."""
         in_process = make_env_of(sample("lerobot_docs_multitask"))(n_envs=2)
         with make_env(sample("lerobot_docs_multitask"), n_envs=2, use_async_envs=True) as suites:
             names = [(suite, list(tasks)) for suite, tasks in suites.items()]
@@ -127,7 +124,6 @@ class TestManyTasks:
         assert eventually(lambda: descendants() <= before)
 
     def test_sub_environments_run_in_processes_of_their_own(self, suites: EnvSuites) -> None:
-        """With ``use_async_envs`` the sub-environments do not share a process with each other."""
         env = suites["rooms"][0]
         env.reset(seed=0)
         pids = env.get_attr("pid")

@@ -59,7 +59,6 @@ def built(sources: list[Source], tell: Callable[[str], None] = lambda line: None
 
 
 def seen(wheel: Path) -> str:
-    """What a build has found, as it wrote it into its wheel."""
     with zipfile.ZipFile(wheel) as archive:
         return archive.read("seen.txt").decode()
 

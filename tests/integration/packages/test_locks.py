@@ -44,7 +44,6 @@ def path_of(folder: Path) -> Path:
 
 
 def verify(folder: Path, *options: str, code: int) -> str:
-    """What ``envhub lock --check`` says."""
     done = RUNNER.invoke(app, ["lock", "--check", str(path_of(folder)), str(folder), *options])
     assert done.exit_code == code, done.output
     return " ".join(done.output.split())

@@ -92,7 +92,6 @@ def envhub(*arguments: str, code: int = 0) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def here() -> dict[str, Any]:
-    """The class, in this process: the test is its author."""
     namespace: dict[str, Any] = {}
     exec(MAZE, namespace)
     return namespace

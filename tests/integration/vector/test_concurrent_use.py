@@ -21,7 +21,6 @@ DEADLINE_S = 60.0
 
 @pytest.fixture(params=["auto"])
 def env(request: pytest.FixtureRequest) -> Iterator[Any]:
-    """A vector environment that has been reset."""
     with make_env(str(SAMPLES / "cartpole"), n_envs=2, policy={"lane": request.param}) as suites:
         suites.env.reset(seed=0)
         yield suites.env

@@ -71,7 +71,6 @@ def counted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def oracle(n_envs: int, mode: str) -> Any:
-    """The same with LeRobot's wrapper, in this process."""
     names: dict[str, Any] = {}
     exec(ENVS, names)
     fns = [lambda i=i: Frozen(names["Counted"](3 + 2 * i + i % 2)) for i in range(n_envs)]

@@ -30,7 +30,6 @@ lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 
 @pytest.fixture
 def gates(tmp_path: Path, lane: str) -> Iterator[Gates]:
-    """Environments with a worker for each sub-environment."""
     with ExitStack() as stack:
         yield Gates(tmp_path, stack, policy={"lane": lane}, min_ready=1)
 
@@ -39,14 +38,12 @@ Call = Callable[[], object]
 
 
 def kill(env: Any, worker: int) -> None:
-    """End the processes of one of its workers."""
     part = inside.parts(env)[worker]
     for pid in inside.part_pids(part):
         os.kill(pid, signal.SIGKILL)
 
 
 def is_waited_for(env: Any, worker: int) -> bool:
-    """Whether another thread's ``recv`` waits for one of its workers."""
     lock = inside.use_lock_of(inside.parts(env)[worker])
     free = lock.acquire(blocking=False)
     if free:

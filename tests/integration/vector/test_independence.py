@@ -131,7 +131,6 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def processes(repository: Path, **kwargs: Any) -> int:
-    """How many processes its sub-environments have."""
     with make_env(repository, N_ENVS, use_async_envs=True, **kwargs) as suites:
         return len(inside.bounds(suites.env))
 
@@ -216,7 +215,6 @@ def test_a_play_may_compute_for_longer_than_it_may_wait(
 
 
 def play(env: Any) -> list[Any]:
-    """Observations, rewards and flags of some steps, also of the second episodes."""
     results: list[Any] = [env.reset(seed=7)[0].copy()]
     for _ in range(12):
         observation, *rest, _ = env.step(np.zeros(N_ENVS, np.int64))

@@ -31,7 +31,6 @@ def send(env: Any, *gates: int, large: int = 0) -> None:
 
 
 def answered(*envs: Any, timeout_s: float | None = None) -> list[int]:
-    """Those whose steps have been answered first."""
     lanes = [inside.session(env).lease.lane for env in envs]
     return answered_first([lane for lane in lanes if lane is not None], Deadline(timeout_s))
 

@@ -25,13 +25,11 @@ from tests.support.objects.gates import DIE, LARGE, RAISE, Gates, ids, send
 
 @pytest.fixture(params=["auto", "frames"])
 def lane(request: pytest.FixtureRequest) -> str:
-    """Over shared memory, and over the server."""
     return str(request.param)
 
 
 @pytest.fixture
 def gates(tmp_path: Path, lane: str) -> Iterator[Gates]:
-    """Environments with a worker for each sub-environment."""
     with ExitStack() as stack:
         yield Gates(tmp_path, stack, policy={"lane": lane}, min_ready=2)
 
@@ -213,7 +211,6 @@ def test_one_worker_is_ready_as_a_whole(gates: Gates) -> None:
 
 @pytest.fixture
 def shards(tmp_path: Path, lane: str) -> Iterator[Gates]:
-    """Environments whose workers are the processes of one jail."""
     with ExitStack() as stack:
         yield Gates(tmp_path, stack, policy={"lane": lane})
 

@@ -68,7 +68,6 @@ def test_gymnasiums_classes_are_among_its_direct_bases() -> None:
 
 
 def test_a_task_is_chosen_by_name() -> None:
-    """One of several must be named; what there is, the error says."""
     with pytest.raises(ValueError, match=r"\['maze'\]\[0\], \['maze'\]\[1\]"):
         SandboxEnv(EXAMPLES / "two_tasks")
     with pytest.raises(ValueError, match=r"no suite 'house'.*there are: \['maze'\]\[0\]"):

@@ -115,7 +115,6 @@ def in_this_process() -> Any:
 
 
 def done(env: gym.vector.VectorEnv[Any, Any, Any], what: str, number: int) -> Any:
-    """One request and what comes of it."""
     if what == "step":
         return env.step(np.array([number % 2, (number // 16) % 3, 0]))[:4]
     if what == "reset":

@@ -22,7 +22,6 @@ from tests.support.started import started
 
 @pytest.fixture(scope="module")
 def narrow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
-    """A server with room for one jail of a key."""
     with listening(tmp_path_factory.mktemp("narrow"), "--max-jails", "1") as server:
         yield server
 

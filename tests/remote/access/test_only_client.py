@@ -27,7 +27,6 @@ def keys() -> tuple[str, str]:
 
 @contextlib.contextmanager
 def announcing(public: str, state: Path) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
-    """Such a server, and the one line that it has printed."""
     words = ("--bind", f"tcp://127.0.0.1:{lasting_port()}", "--state-dir", str(state))
     process = subprocess.Popen(
         [*WORKER, "listen", *words, "--only-client", public, "--announce", "--until-eof"],

@@ -40,7 +40,6 @@ def narrow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
 
 
 def program(server: Listening, repository: Path, end: str) -> subprocess.Popen[bytes]:
-    """A short program that uses an environment there."""
     words = server.endpoint, server.public, server.client_key, str(repository), end
     return subprocess.Popen(
         [sys.executable, "-c", _SHORT, *words],
@@ -57,7 +56,6 @@ def connected(server: Listening) -> bool:
 
 @contextmanager
 def at_work(server: Listening, repository: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A program that keeps its environment meanwhile, and ends after it."""
     assert eventually(lambda: not connected(server))  # whoever was there before is known to be gone
     client = program(server, repository, "waits")
     assert client.stdout is not None

@@ -204,7 +204,6 @@ def test_a_port_scan_is_a_few_lines_in_the_log(server: Listening, good: Any) -> 
 
 
 def failures(server: Listening) -> int:
-    """How many lines its log has of handshakes that failed."""
     return server.said().count("warning handshake_failed")
 
 

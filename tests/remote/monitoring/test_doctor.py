@@ -19,14 +19,12 @@ RUNNER = CliRunner()
 
 
 def doctor(server: Listening, *options: str, key: str | None = None) -> tuple[int, str, str]:
-    """The exit code of a look at a server, and what was printed on both streams."""
     words = ["doctor", f"{server.endpoint} {server.public}", *options]
     done = RUNNER.invoke(app, words, env={"ENVHUB_CLIENT_KEY": key or server.client_key})
     return done.exit_code, done.stdout, done.stderr
 
 
 def looked(server: Listening) -> tuple[int, dict[str, Any]]:
-    """The exit code of a look, and what a program is told of the server."""
     code, out, _ = doctor(server, "--profile", "container", "--json")
     return code, json.loads(out)["server"]
 

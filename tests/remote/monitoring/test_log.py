@@ -40,19 +40,16 @@ def logging_server(folder: Path, names: dict[str, KeyPair], *options: str) -> It
 
 
 def replace(path: Path, text: str) -> None:
-    """At once: nobody reads half of it."""
     new = path.with_suffix(".new")
     new.write_text(text, "utf-8")
     os.replace(new, path)
 
 
 def events(server: Listening) -> list[dict[str, Any]]:
-    """All that a server has said; every line of it is JSON."""
     return [json.loads(line) for line in server.said().splitlines()]
 
 
 def of(server: Listening, event: str, **fields: object) -> list[dict[str, Any]]:
-    """The events of a name that have these fields."""
     return [
         one
         for one in events(server)

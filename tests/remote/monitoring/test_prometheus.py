@@ -61,7 +61,6 @@ class Prometheus:
             return False
 
     def query(self, expression: str) -> list[Any]:
-        """The samples of an expression now; an expression that it cannot read is an error."""
         words = urllib.parse.urlencode({"query": expression})
         url = f"http://{self.address}/api/v1/query?{words}"
         try:

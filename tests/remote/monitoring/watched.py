@@ -23,7 +23,6 @@ class Watched:
     port: int
 
     def get(self, path: str) -> tuple[int, str]:
-        """The status and the text of a page."""
         return get(self.port, path)
 
     def values(self) -> dict[tuple[str, ...], float]:
@@ -37,12 +36,10 @@ class Watched:
         }
 
     def shows(self, *name: str, value: float) -> bool:
-        """Whether a sample comes to have that value."""
         return eventually(lambda: self.values().get(name) == value)
 
 
 def get(port: int, path: str) -> tuple[int, str]:
-    """The status and the text of a page."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
     try:
         connection.request("GET", path)

@@ -98,7 +98,6 @@ def test_a_killed_driver_leaves_nothing(cluster: Any, repository: Path, tmp_path
 
 
 def start_driver(address: str, repository: Path) -> subprocess.Popen[str]:
-    """A process with an environment on the cluster, which steps."""
     command = [sys.executable, "-c", DRIVER, address, str(repository)]
     driver = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert driver.stdout is not None

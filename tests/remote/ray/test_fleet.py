@@ -90,7 +90,6 @@ def environment(restart: str) -> dict[str, Any]:
 
 
 def placed() -> Counter[str]:
-    """How many servers each node has."""
     return Counter(map(node_of, servers()))
 
 

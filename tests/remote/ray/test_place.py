@@ -35,7 +35,6 @@ def repository(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="class")
 def pair(request: pytest.FixtureRequest, case: Case, cluster: Any) -> Iterator[Pair]:
-    """The reference here and the environment on a node; a class's tests share them."""
     with paired(request.cls.sample, case, sandbox=RaySandbox(num_cpus=1)) as both:
         yield both
 

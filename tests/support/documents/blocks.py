@@ -95,5 +95,4 @@ def blocks() -> Iterator[Block]:
 
 
 def tested(way: str) -> list[Block]:
-    """The blocks that are tested in this way."""
     return [block for block in blocks() if block.way == way]

@@ -99,7 +99,6 @@ _WITH_PYTHON = {"docs/deployment.md"}
 
 
 def executed(document: str) -> list[Block]:
-    """What is executed here of a document."""
     languages = {"sh", "python"} if document in _WITH_PYTHON else {"sh"}
     there = [one for one in tested(RUN) if one.document == document]
     return [one for one in there if one.language in languages]

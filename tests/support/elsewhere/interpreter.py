@@ -344,7 +344,6 @@ def _windows_locks() -> None:
 
 
 def main() -> None:
-    """Become another system, and run what is said."""
     system, how, what = sys.argv[1:4]
     become(system)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # also where we are in the background

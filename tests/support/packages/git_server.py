@@ -47,7 +47,6 @@ def make_repository(folder: Path, files: Mapping[str, str]) -> str:
 
 
 def commit(folder: Path) -> str:
-    """Commit what is there, and return the commit."""
     git(folder, "add", "--all")
     git(folder, "commit", "--quiet", "--message=x")
     return git(folder, "rev-parse", "HEAD")

@@ -34,7 +34,6 @@ def make_wheel(
     tag: str = "py3-none-any",
     python: str = "",
 ) -> Path:
-    """Write a wheel with these files; by default a package whose import says so."""
     distribution = name.replace("-", "_")
     given = {f"{distribution}/__init__.py": f"VERSION = {version!r}\n"} if files is None else files
     info = f"{distribution}-{version}.dist-info"
@@ -169,7 +168,6 @@ class Index:
 
 @contextmanager
 def served(folder: Path) -> Iterator[Index]:
-    """Serve a folder as an index on loopback."""
     index = Index(folder)
 
     class Handler(QuietHandler):

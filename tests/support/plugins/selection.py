@@ -18,7 +18,6 @@ _NAMED = {"strict", "no-userns", "auto", "frames"}
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--full`` and ``--one-case``."""
     text = "run every test, and not only what is marked as short"
     parser.addoption("--full", action="store_true", help=text)
     text = "of each test's cases only the first, for each profile and lane"

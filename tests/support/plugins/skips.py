@@ -53,7 +53,6 @@ def by_reason(reports: Iterable[pytest.TestReport | pytest.CollectReport]) -> di
 
 
 def reason_of(report: pytest.TestReport | pytest.CollectReport) -> str:
-    """Why it was skipped, in a few words."""
     told = report.longrepr
     text = str(told[2] if isinstance(told, tuple) else told).removeprefix("Skipped: ")
     missing = _NOT_INSTALLED.search(text)

@@ -19,13 +19,11 @@ _F_SETLEASE, _F_WRLCK = 1024, 1
 
 
 def read_file(path):
-    """Open a file by its path."""
     with open(path, "rb") as file:
         return file.read(65536).decode("utf-8", "replace")
 
 
 def list_folder(path):
-    """List a folder."""
     return os.listdir(path)
 
 
@@ -35,7 +33,6 @@ def stat_file(path):
 
 
 def read_through_symlink(path):
-    """Make a symbolic link to a file in the scratch folder and open that."""
     link = os.path.join(tempfile.mkdtemp(), "link")
     os.symlink(path, link)
     with open(link) as file:
@@ -43,7 +40,6 @@ def read_through_symlink(path):
 
 
 def read_through_hard_link(path, folders):
-    """Give a file a second name in a folder that may be read, and open that."""
     errors = []
     for folder in [*folders, os.environ.get("HOME", "/"), "/tmp", "/dev/shm"]:
         link = os.path.join(folder, f"link-{os.getpid()}")
@@ -147,7 +143,6 @@ def hold_file(path, way):
 
 
 def create_file(path, text):
-    """Put a new file somewhere, whatever its folder's mode is."""
     with contextlib.suppress(OSError):
         folder = os.path.dirname(path)
         os.chmod(folder, os.stat(folder).st_mode | 0o777)  # /tmp keeps its sticky bit
@@ -156,7 +151,6 @@ def create_file(path, text):
 
 
 def write_file(path, text):
-    """Change a file: append to it, or put another in its place."""
     errors = []
     for change in (_make_writable, _append, _replace, _truncate):
         try:
@@ -188,7 +182,6 @@ def _truncate(path, text):
 
 
 def delete_file(path):
-    """Delete a file, whatever its folder's mode is."""
     with contextlib.suppress(OSError):
         folder = os.path.dirname(path)
         os.chmod(folder, os.stat(folder).st_mode | 0o777)  # /tmp keeps its sticky bit
@@ -196,7 +189,6 @@ def delete_file(path):
 
 
 def rename_file(path):
-    """Move a file away, whatever its folder's mode is."""
     with contextlib.suppress(OSError):
         folder = os.path.dirname(path)
         os.chmod(folder, os.stat(folder).st_mode | 0o777)  # /tmp keeps its sticky bit
@@ -204,17 +196,14 @@ def rename_file(path):
 
 
 def change_attribute(path):
-    """Attach an attribute to a file."""
     os.setxattr(path, "user.attack", b"was here")
 
 
 def change_mode(path):
-    """Change a file's permissions."""
     os.chmod(path, 0o666)
 
 
 def change_owner(path, gid):
-    """Give a file to another group."""
     os.chown(path, -1, gid)
 
 
@@ -232,7 +221,6 @@ def plant(text):
 
 
 def raid(paths, text):
-    """Read and overwrite a file that another jail keeps in its scratch folder."""
     found = []
     for path in paths:
         try:

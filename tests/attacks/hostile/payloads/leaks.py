@@ -11,13 +11,11 @@ _SESSION, _USER, _USER_SESSION = -3, -4, -5
 
 
 def where_am_i():
-    """Where this process finds itself; not an attack."""
     here = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
     return {"root": here, "cwd": os.getcwd(), "home": os.environ["HOME"], "pid": os.getpid()}
 
 
 def environment():
-    """Read the environment that this process was started with."""
     with open("/proc/self/environ", "rb") as file:
         return [dict(os.environ), file.read().decode("utf-8", "replace")]
 
@@ -44,7 +42,6 @@ def _of_each_process(pid, file):
 
 
 def inherited_descriptors():
-    """Read whatever files this process was born with."""
     found = []
     for fd in range(3, 256):
         try:
@@ -77,7 +74,6 @@ def own_memory(prefix):
 
 
 def keyring(name):
-    """Read a key out of the keyrings that this process was given."""
     errors = []
     for keyring in (_USER, _SESSION, _USER_SESSION):
         try:

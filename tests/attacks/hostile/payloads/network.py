@@ -16,7 +16,6 @@ _heard = {"bytes": b""}
 
 
 def tcp(host, port, message):
-    """Connect to a TCP port and send a message."""
     with socket.create_connection((host, port), timeout=5) as connection:
         connection.sendall(message.encode())
 
@@ -35,7 +34,6 @@ def mptcp(host, port, message):
 
 
 def udp(host, port, message):
-    """Send a datagram, to a connected and to an unconnected socket."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_DGRAM) as sender:
         sender.sendto(message.encode(), (host, port))
@@ -71,7 +69,6 @@ def packet(device, message):
 
 
 def vsock(cid, port, message):
-    """Send a message over a VM socket."""
     with socket.socket(socket.AF_VSOCK, socket.SOCK_STREAM) as sender:
         sender.settimeout(5)
         sender.connect((cid, port))
@@ -88,7 +85,6 @@ def unix_stream(path, message):
 
 
 def unix_datagram(path, message):
-    """Send a datagram to a socket file, as one does to the system's log."""
     address = "\0" + path[1:] if path.startswith("@") else path
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
         sender.sendto(message.encode(), address)
@@ -119,7 +115,6 @@ def netlink_message(port, message):
 
 
 def netlink_routes():
-    """Ask the kernel for the host's network addresses over netlink."""
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as asker:
         asker.bind((0, 0))
         asker.send(struct.pack("=IHHII4xIII", 32, 18, 0x301, 1, 0, 0, 0, 0))
@@ -142,7 +137,6 @@ def _read(path):
 
 
 def device_events(group, seconds):
-    """Wait for the kernel's events of the host's devices."""
     heard = []
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, _UEVENT) as ear:
         ear.bind((0, group))

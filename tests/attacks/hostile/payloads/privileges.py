@@ -50,8 +50,6 @@ def clone_with_namespace(alias, way):
 
 
 def chroot(alias):
-    """Make another folder the root: the first half of leaving a chroot."""
-
     def change():
         try:
             os.chroot(tempfile.mkdtemp())
@@ -63,8 +61,6 @@ def chroot(alias):
 
 
 def pivot_root(alias):
-    """Exchange the root for another one."""
-
     def pivot():
         place = tempfile.mkdtemp().encode()
         try:
@@ -79,7 +75,6 @@ def pivot_root(alias):
 
 
 def mount_tmpfs(alias, source):
-    """Mount something."""
     place = tempfile.mkdtemp()
 
     def work():
@@ -101,8 +96,6 @@ def mount_tmpfs(alias, source):
 
 
 def remount_root(alias):
-    """Change what the root may be used for: a sandbox's is read-only."""
-
     def remount():
         answers = []
         try:
@@ -214,7 +207,6 @@ class _Program(ctypes.Structure):
 
 
 def stack_filters(way):
-    """Install as many filters of the greatest length as the kernel takes, on one thread."""
     load, allow = struct.pack("=HBBI", 0x20, 0, 0, 0), struct.pack("=HBBI", 6, 0, 0, 0x7FFF0000)
     code = ctypes.create_string_buffer(load * (_LENGTH - 1) + allow)
     program = _Program(_LENGTH, ctypes.addressof(code))

@@ -69,7 +69,6 @@ def ptrace_poke(pid, address, word):
 
 
 def process_vm_read(pid, address, size):
-    """Read another process's memory without attaching to it."""
     buffer = ctypes.create_string_buffer(size)
     ours = (ctypes.c_ulong * 2)(ctypes.addressof(buffer), size)
     theirs = (ctypes.c_ulong * 2)(address, size)
@@ -78,7 +77,6 @@ def process_vm_read(pid, address, size):
 
 
 def process_vm_write(pid, address, message):
-    """Write another process's memory without attaching to it."""
     buffer = ctypes.create_string_buffer(message.encode())
     ours = (ctypes.c_ulong * 2)(ctypes.addressof(buffer), len(message))
     theirs = (ctypes.c_ulong * 2)(address, len(message))
@@ -86,13 +84,11 @@ def process_vm_write(pid, address, message):
 
 
 def proc_mem_read(pid, address, size):
-    """Read another process's memory as a file."""
     with open(f"/proc/{pid}/mem", "rb", 0) as memory:
         return os.pread(memory.fileno(), size, address).decode("ascii", "replace")
 
 
 def proc_mem_write(pid, address, message):
-    """Write another process's memory as a file."""
     fd = os.open(f"/proc/{pid}/mem", os.O_RDWR)
     os.pwrite(fd, message.encode(), address)
 
@@ -104,53 +100,43 @@ def proc_maps(pid):
 
 
 def proc_fd(pid, fd):
-    """Open what another process has open, through /proc."""
     copy = os.open(f"/proc/{pid}/fd/{fd}", os.O_RDONLY)
     return os.pread(copy, 4096, 0).decode("ascii", "replace")
 
 
 def pidfd_getfd(pid, fd):
-    """Take a descriptor out of another process."""
     copy = syscall("pidfd_getfd", syscall("pidfd_open", pid, 0), fd, 0)
     return os.pread(copy, 4096, 0).decode("ascii", "replace")
 
 
 def prlimit(pid, files):
-    """Lower another process's limits."""
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     limits = struct.pack("=QQ", files, hard & (2**64 - 1))
     syscall("prlimit64", pid, resource.RLIMIT_NOFILE, limits, None)
 
 
 def oom_score(pid, score):
-    """Have another process killed first when memory runs out."""
     with open(f"/proc/{pid}/oom_score_adj", "w") as file:
         file.write(str(score))
 
 
 def setpriority(pid, nice):
-    """Make another process slow."""
     os.setpriority(os.PRIO_PROCESS, pid, nice)
 
 
 def ioprio_set(pid, priority):
-    """Make another process's disk accesses wait for everybody else's."""
     syscall("ioprio_set", 1, pid, priority)
 
 
 def sched_setaffinity(pid, cpus):
-    """Tie another process to one core."""
     os.sched_setaffinity(pid, cpus)
 
 
 def sched_setscheduler(pid):
-    """Give another process the lowest of scheduling classes."""
     os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
 
 
 def enter_namespaces(alias, pid):
-    """Move into the namespaces of another process."""
-
     def enter():
         try:
             syscall("setns", syscall("pidfd_open", pid, 0), CLONE_NEWUSER)

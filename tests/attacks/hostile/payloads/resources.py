@@ -21,7 +21,6 @@ above that none of them could send any, and what they want to send is lost."""
 
 
 def fork_bomb(count):
-    """Fork, and have the children stay."""
     forked = 0
     for _ in range(count):
         try:
@@ -38,7 +37,6 @@ def fork_bomb(count):
 
 
 def thread_bomb(count):
-    """Start threads, and have them stay."""
     for _ in range(count):
         thread = threading.Thread(target=threading.Event().wait, args=(300,), daemon=True)
         thread.start()
@@ -55,7 +53,6 @@ def spin(seconds):
 
 
 def flood(size):
-    """Print without end."""
     line = b"x" * 8191 + b"\n"
     written = 0
     while written < size:
@@ -65,7 +62,6 @@ def flood(size):
 
 
 def fill_disk(folders, size):
-    """Fill every folder that takes something."""
     own = [os.environ.get("HOME", "/"), tempfile.gettempdir(), os.getcwd(), "/dev/shm"]
     written = {}
     for folder in folders or own:
@@ -83,7 +79,6 @@ def fill_disk(folders, size):
 
 
 def fill_inodes(folders, count):
-    """Create empty files until there are no more to be had."""
     own = [os.environ.get("HOME", "/"), tempfile.gettempdir(), os.getcwd(), "/dev/shm"]
     made = {}
     for folder in folders or own:
@@ -99,7 +94,6 @@ def fill_inodes(folders, count):
 
 
 def large_pipe(size):
-    """Make a pipe as large as a plain user may."""
     kept.append(os.pipe())
     fcntl.fcntl(kept[-1][1], 1031, size)  # F_SETPIPE_SZ
 

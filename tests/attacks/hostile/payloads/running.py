@@ -17,11 +17,9 @@ def run(name, arguments, alias):
 
 
 def attack_of(name):
-    """The attack of that name, of whatever kind."""
     kinds = (importlib.import_module(f"payloads.{kind}") for kind in _KINDS)
     return next(getattr(kind, name) for kind in kinds if hasattr(kind, name))
 
 
 def call_me(alias):
-    """Set this process's name, as others see it."""
     ctypes.CDLL(None).prctl(_PR_SET_NAME, alias.encode(), 0, 0, 0)
