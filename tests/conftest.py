@@ -45,7 +45,6 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 @pytest.hookimpl(trylast=True)
 def pytest_collection_finish() -> None:
     """Ten thousand tests stay to the end: no collection of garbage looks through them again.
-
     And PYTEST_ADDOPTS has been read by all workers: a test that runs pytest has options of its own.
     """
     os.environ.pop("PYTEST_ADDOPTS", None)

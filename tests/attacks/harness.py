@@ -36,14 +36,7 @@ Succeeded = Callable[["Run"], object]
 
 @dataclass
 class Run:
-    """One run of a payload.
-
-    Attributes:
-        alias: The name of its process; see ``pids``.
-        inside: Whether it ran in a sandbox.
-        value: What it returned.
-        error: The text of what it raised or how it died; empty otherwise.
-    """
+    """One run of a payload."""
 
     alias: str
     inside: bool
@@ -77,12 +70,7 @@ class StoppedNowError(AssertionError):
 
 
 class Attacks:
-    """Where a payload is run as a control and inside.
-
-    Attributes:
-        inside: Runs a payload in a jail, which lives as long as the context.
-        judge: Notes what an attack did, and fails unless that is what is expected of this place.
-    """
+    """Where a payload is run as a control and inside."""
 
     inside: Callable[..., contextlib.AbstractContextManager[Run]]
     judge: Callable[..., None]
@@ -137,14 +125,7 @@ class Attacks:
 
 @dataclass
 class Arena(Attacks):
-    """Where one test attacks: one profile, as the user that this process is.
-
-    Attributes:
-        profile: The policy's profile.
-        family: Heading in the table.
-        rows: What was found out, for the table.
-        report: What the last jail said of its layers.
-    """
+    """Where one test attacks: one profile, as the user that this process is."""
 
     profile: str
     family: str
@@ -212,13 +193,7 @@ class Arena(Attacks):
 
 @dataclass(frozen=True)
 class OpenJail(Attacks):
-    """The same attacks in a jail that is open already, and is left open for the next one.
-
-    Attributes:
-        arena: Where it is.
-        env: The hostile repository's environment in it.
-        prefix: Of the titles.
-    """
+    """The same attacks in a jail that is open already, and is left open for the next one."""
 
     arena: Arena
     env: Any

@@ -17,10 +17,8 @@ def pair(request: pytest.FixtureRequest, case: Case, lane: str) -> Iterator[Pair
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run each test of a suite once for each of its class's cases, and of each lane.
-
     ``lane`` is how steps travel: ``"auto"`` over shared memory where it can be, ``"frames"`` never.
-    All cases go the first way, the class's last ones both.
-    """
+    All cases go the first way, the class's last ones both."""
     cases: list[Case] | None = getattr(metafunc.cls, "cases", None)
     marks = metafunc.definition.iter_markers("parametrize")
     chosen = any("lane" in mark.args[0] for mark in marks)

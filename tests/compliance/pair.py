@@ -13,12 +13,7 @@ VectorEnv = Any
 
 @dataclass
 class Pair:
-    """A reference in this process and the sandboxed environment that must do the same.
-
-    Attributes:
-        reference: What the repository's ``make_env`` builds with ``SyncVectorEnv``.
-        sandboxed: The proxy of the same repository with the same arguments.
-    """
+    """A reference in this process and the sandboxed environment that must do the same."""
 
     reference: VectorEnv
     sandboxed: VectorEnv
@@ -48,11 +43,7 @@ class Pair:
         return actual
 
     def drive(self, seed: int, steps: int) -> int:
-        """Reset and step both; with autoreset disabled, reset what has ended by mask.
-
-        Returns:
-            How many episodes ended.
-        """
+        """Reset and step both; with autoreset disabled, reset what has ended by mask."""
         self.reset(seed=seed)
         ended = 0
         for number, actions in enumerate(self.sample_actions(seed, steps)):

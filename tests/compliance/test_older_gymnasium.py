@@ -35,12 +35,7 @@ def runtimes() -> Iterator[Any]:
 
 @dataclass(frozen=True)
 class OlderCase(Case):
-    """A way to build the sample under an older release.
-
-    Attributes:
-        requirements: What is installed.
-        mode: What its vector environments do, as the client's would be asked for it.
-    """
+    """A way to build the sample under an older release."""
 
     requirements: tuple[str, ...] = OLD
     mode: str = "SameStep"

@@ -60,13 +60,7 @@ def each_mode(n_envs: int) -> list[Case]:
 
 @contextlib.contextmanager
 def paired(name: str, case: Case, **options: Any) -> Iterator[Pair]:
-    """A sample's reference and its sandboxed environment, which live as long as the context.
-
-    Args:
-        name: Of the repository under ``tests/samples``.
-        case: How both are built.
-        options: What else ``make_env`` takes: the place, the lane.
-    """
+    """A sample's reference and its sandboxed environment, which live as long as the context."""
     expected = reference(name, case.n_envs, **case.env_kwargs)
     suites = make_env(
         sample(name),

@@ -45,9 +45,7 @@ def folders(client: int | None = None) -> list[Path]:
 
 def nothing_left(engine: Engine, client: int | None = None) -> bool:
     """Whether no container of a client is left, ours by default; waits for it.
-
-    Of ours one may linger until its time comes; that is ended first.
-    """
+    Of ours one may linger until its time comes; that is ended first."""
     if client is None:
         stop_idle()
     return eventually(lambda: not containers_of(engine, client or os.getpid()), 60.0)

@@ -214,12 +214,7 @@ class Attribution(RuleBasedStateMachine):
 
 
 class Transparent(Attribution):
-    """The same, where the dead come back by themselves.
-
-    Attributes:
-        lost: Rows that are dead, for the next step or reset to bring back.
-        over: Rows whose episode was truncated by that, so that a step resets them.
-    """
+    """The same, where the dead come back by themselves."""
 
     restart = "transparent"
     after_death = State.READY
@@ -299,9 +294,7 @@ def test_no_result_is_attributed_to_another_request(
     machine: type[Attribution], lane: str, shards: int
 ) -> None:
     """Whatever is interleaved, an answer is the answer to its own request.
-
-    ``ENVHUB_FAULTS=full`` tries a hundred times as much.
-    """
+    ``ENVHUB_FAULTS=full`` tries a hundred times as much."""
     machine = type("Machine", (machine,), {"lane": lane, "shards": shards})
     examples = 800 if os.environ.get("ENVHUB_FAULTS") == "full" else 8
     few = settings(max_examples=examples, stateful_step_count=15, deadline=None, print_blob=True)

@@ -253,9 +253,7 @@ def test_a_granted_secret_is_not_in_the_bundle(
     secret: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The environment prints it: the error shows it, and no file of the bundle has any of it.
-
-    Nor where it has lines, of which each has a margin, or begins with another variable's value.
-    """
+    Nor where it has lines, of which each has a margin, or begins with another variable's value."""
     monkeypatch.setenv("SERVICE_KIND", secret[:6])
     monkeypatch.setenv("SERVICE_KEY", secret)
     (tmp_path / "env").mkdir()

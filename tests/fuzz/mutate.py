@@ -31,12 +31,7 @@ def _member(value: object) -> RemoteEnum:
 
 
 class Spoiler:
-    """Makes junk, and puts it where something else was.
-
-    Args:
-        rng: Decides everything.
-        donors: Values that may stand where others belong.
-    """
+    """Makes junk, and puts it where something else was."""
 
     def __init__(self, rng: random.Random, donors: list[Any]) -> None:
         self.rng, self.donors = rng, donors
@@ -258,11 +253,7 @@ def packed(value: Any) -> bytes:
 
 
 def wire(value: Any) -> Any:
-    """A value as it arrives; None of it crosses that has no form.
-
-    Raises:
-        ProtocolError: The wire does not carry it.
-    """
+    """A value as it arrives; None of it crosses that has no form."""
     return decode(encode(value, limits=SMALL))
 
 

@@ -59,13 +59,7 @@ SIZES = ((3,), (1, 2), (2, 2))
 
 @dataclass
 class Dice:
-    """One example.
-
-    Attributes:
-        rng: Decides everything.
-        corpus: Messages of real workers.
-        messages: The same, decoded.
-    """
+    """One example."""
 
     rng: random.Random
     corpus: list[Frames]

@@ -41,7 +41,6 @@ def stub_hub() -> Iterator[StubHub]:
 @pytest.fixture
 def snapshot_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty store of snapshots (``$ENVHUB_CACHE``), and no token of the developer's.
-
     Nor is the developer's Hub cache a command's: two runs would wait for each other's locks there.
     """
     store = tmp_path / "envhub-cache"

@@ -77,12 +77,7 @@ class GitRepository:
 
 
 class OlahServer:
-    """An olah process. ``endpoint`` is what huggingface_hub takes.
-
-    Args:
-        home: An empty folder for its repositories and logs.
-        python: The interpreter that has olah.
-    """
+    """An olah process. ``endpoint`` is what huggingface_hub takes."""
 
     def __init__(self, home: Path, python: str = sys.executable) -> None:
         self.home = home

@@ -46,9 +46,7 @@ def written(repository: str) -> tuple[list[list[str]], str]:
 
 def run(program: str, olah: OlahServer, home: Path, *arguments: str) -> Any:
     """The last line that a program of this folder prints, which is JSON.
-
-    The test is skipped where there is no LeRobot.
-    """
+    The test is skipped where there is no LeRobot."""
     own, overlay = os.environ.get(OWN), os.environ.get(OVERLAY)
     if not own and not overlay:
         pytest.skip("needs LeRobot")

@@ -17,9 +17,7 @@ IMPATIENT_S = 8
 @pytest.fixture(autouse=True)
 def _patient() -> Iterator[None]:
     """Who is slow is not gone: a loaded machine takes the core from a server for a long time.
-
-    A test of how soon a server counts as gone says by itself how soon.
-    """
+    A test of how soon a server counts as gone says by itself how soon."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("envhub_sandbox.extras.remote.tcp.CONNECT_S", 60.0)
         for spot in (*inside.WAITS_FOR_A_SERVER, inside.WAIT_FOR_OUTPUT):

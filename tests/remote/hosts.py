@@ -17,12 +17,7 @@ def _run(*words: str) -> subprocess.CompletedProcess[str]:
 
 @dataclass
 class OtherHost:
-    """The far end of a veth pair; the near one is here.
-
-    Attributes:
-        address: Its address.
-        prefix: Runs a command there.
-    """
+    """The far end of a veth pair; the near one is here."""
 
     namespace: str
     device: str

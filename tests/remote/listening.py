@@ -65,13 +65,7 @@ def counting(folder: Path, *, files: dict[str, bytes] | None = None) -> Path:
 
 @dataclass
 class Listening:
-    """A running server.
-
-    Attributes:
-        endpoint: Where it listens.
-        public: Its public key.
-        state: Its state folder.
-    """
+    """A running server."""
 
     process: subprocess.Popen[bytes]
     endpoint: str

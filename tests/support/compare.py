@@ -18,10 +18,8 @@ def rolled(env: Any) -> list[Any]:
 
 def assert_same(expected: object, actual: object, what: str = "value") -> None:
     """Assert that two values are the same: types, dtypes, shapes, bits, order of keys.
-
     A value that cannot cross as itself (an enum member, an object of the repository) is the same
-    when its inert stand-in says so.
-    """
+    when its inert stand-in says so."""
     found = next(differences(expected, actual, what), None)
     assert found is None, found
 

@@ -20,12 +20,7 @@ Policy = Callable[[dict[str, Any]], torch.Tensor]
 def rollout(
     env: Any, policy: Policy, seeds: list[int] | None, frames: list[Any] | None
 ) -> dict[str, Any]:
-    """Step all sub-environments until each has been done once; None renders nothing.
-
-    Returns:
-        ``action``, ``reward``, ``success`` and ``done``, stacked as ``(batch, steps, ...)``, the
-        observations and the tasks as the policy saw them.
-    """
+    """Step all sub-environments until each has been done once; None renders nothing."""
     observation, _ = env.reset(seed=seeds, options={"lerobot_new_rollout": True})
     if frames is not None:
         frames.append(_render(env))

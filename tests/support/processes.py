@@ -12,10 +12,8 @@ import psutil
 
 def descendants() -> set[int]:
     """Pids of every live process below this one; zombies do not count.
-
     Nor does what ``multiprocessing`` has started for this very process, for a test that compared
-    with Gymnasium's ``AsyncVectorEnv``: it stays as long as we do.
-    """
+    with Gymnasium's ``AsyncVectorEnv``: it stays as long as we do."""
     below: set[int] = set()
     for child in psutil.Process().children():
         if _alive(child) and not _is_multiprocessings(child):
@@ -51,9 +49,7 @@ def halted(pids: Iterable[int]) -> Iterator[None]:
 
 def other_niceness() -> int:
     """The lowest priority that this process does not have itself, however it was started.
-
-    Only root may raise a priority, where the run has the lowest one.
-    """
+    Only root may raise a priority, where the run has the lowest one."""
     return 19 if os.nice(0) < 19 else 18
 
 
@@ -72,9 +68,7 @@ def resident() -> dict[int, int]:
 
 def most_grown(before: dict[int, int]) -> int:
     """By how many bytes the one of these has grown that has grown most.
-
-    Who has ended since does not count: a server of earlier tests may linger, and its time come.
-    """
+    Who has ended since does not count: a server of earlier tests may linger, and its time come."""
     now = resident()
     return max(now[pid] - bytes_ for pid, bytes_ in before.items() if pid in now)
 
@@ -82,10 +76,8 @@ def most_grown(before: dict[int, int]) -> int:
 @contextlib.contextmanager
 def unless_ended(pid: int) -> Iterator[None]:
     """What is asked of a process that may end meanwhile is left unanswered once it has.
-
     As long as nobody has asked for its end, its entry in ``/proc`` is there, and is root's: a plain
-    user is refused what was his a moment ago.
-    """
+    user is refused what was his a moment ago."""
     try:
         yield
     except (FileNotFoundError, ProcessLookupError):

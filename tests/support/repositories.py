@@ -53,11 +53,7 @@ def make_env(n_envs=1, use_async_envs=False, name="CartPole-v1"):
 
 
 def write_repository(folder: Path, env_py: str, **files: str) -> Path:
-    """Write a repository with an ``env.py`` and other files, named with ``__`` for a dot.
-
-    Returns:
-        The folder.
-    """
+    """Write a repository with an ``env.py`` and other files, named with ``__`` for a dot."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "env.py").write_text(env_py)
     for name, text in files.items():

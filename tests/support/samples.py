@@ -23,11 +23,7 @@ _MODULES = {"gymnasium[box2d]": "Box2D", "gymnasium[mujoco]": "mujoco"}
 
 
 def sample(name: str) -> Path:
-    """The folder of a sample repository; the test is skipped if what it requires is missing.
-
-    Raises:
-        FileNotFoundError: There is none of that name.
-    """
+    """The folder of a sample repository; the test is skipped if what it requires is missing."""
     folder = SAMPLES / name
     if not folder.is_dir():
         raise FileNotFoundError(f"no sample repository named {name!r}")

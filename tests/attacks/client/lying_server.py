@@ -44,14 +44,7 @@ Lie = Callable[["Asked"], list[Frames]]
 
 @dataclass(frozen=True)
 class Asked:
-    """A request, and what an honest server would answer.
-
-    Attributes:
-        request_id: Id of the client's message.
-        request: The message for the runner, or for the server where there is no runner in it.
-        relayed: Whether it was for the runner.
-        honest: The honest answer.
-    """
+    """A request, and what an honest server would answer."""
 
     request_id: int
     request: m.Message

@@ -77,12 +77,7 @@ OF_ONE: dict[str, Any] = {
 
 
 class Naive:
-    """The control: a proxy that serves what a manifest lists, as ``__getattr__`` invites to.
-
-    Args:
-        env: By way of which the worker is asked.
-        listed: The names that it lists.
-    """
+    """The control: a proxy that serves what a manifest lists, as ``__getattr__`` invites to."""
 
     def __init__(self, env: SandboxVectorEnv, *listed: str) -> None:
         self._env = env
@@ -241,9 +236,7 @@ def test_suites_show_the_clients_own_text(liar: LyingServer, folder: str) -> Non
 
 def test_no_name_that_a_library_looks_for_reaches_the_wire(liar: LyingServer, folder: str) -> None:
     """Not one of them is asked of a worker that lists them all; honest ones are.
-
-    Found out by doing it: copying, converting, showing and inspecting an object that listens.
-    """
+    Found out by doing it: copying, converting, showing and inspecting an object that listens."""
     names = names_asked_for()
     for library, some in ASKED.items():
         if importlib.util.find_spec(library):

@@ -144,9 +144,7 @@ def test_a_generator_that_the_caller_keeps_gets_no_bad_state(
     liar: LyingServer, folder: str, what: str | None
 ) -> None:
     """It is brought up to date in place after each request, by states that are checked as before.
-
-    The control is an honest worker, whose state it takes.
-    """
+    The control is an honest worker, whose state it takes."""
     with opened(liar, folder) as suites:
         liar.lies[m.GetRandom] = relayed(m.Value((FIRST, FIRST)))
         kept = suites.env.np_random

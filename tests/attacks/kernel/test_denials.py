@@ -57,10 +57,8 @@ def attempts(denied: Sequence[str]) -> list[str]:
 
 def test_a_recorded_jail_is_refused_the_same(tmp_path: Path) -> None:
     """With the same errors; each attempt is told once, however often, and only where it is asked.
-
     The control is the jail that records nothing, and the reset that tries nothing: the jail's own
-    test of its denials is no attempt of the repository.
-    """
+    test of its denials is no attempt of the repository."""
     folder = write_environment(tmp_path / "attempts", _ATTEMPTS)
     answers = {}
     for recorded in (False, True):
@@ -119,9 +117,7 @@ _NOBODY = 1 << 30
 @pytest.mark.parametrize("profile", profiles("strict", "no-userns"))
 def test_who_names_a_process_that_is_not_its_own_is_told(home: Path, profile: str) -> None:
     """And is answered as ever; of its own ones, and of one that has ended, nothing is told.
-
-    The controls are the jail that records nothing, and what the repository does with its own.
-    """
+    The controls are the jail that records nothing, and what the repository does with its own."""
     folder = write_environment(home / "processes", _PROCESSES)
     answers, told = {}, {}
     for recorded in (False, True):
@@ -262,9 +258,7 @@ class Files(Plain):
 
 def test_files_that_are_asked_for_are_told(tmp_path: Path) -> None:
     """As they are refused anyway; of a flood of files or sockets a few, and it hides nothing else.
-
-    The controls are the jail that records nothing, and what the repository does with its own.
-    """
+    The controls are the jail that records nothing, and what the repository does with its own."""
     folder = write_environment(tmp_path / "files", _FILES)
     answers = {}
     for recorded in (False, True):
@@ -323,9 +317,7 @@ for attempt in (lambda: socket.socket(socket.AF_INET), lambda: open("/home/other
 @pytest.mark.parametrize("ending", _ENDINGS)
 def test_what_ends_a_jail_tells_what_it_was_denied(ending: str, tmp_path: Path) -> None:
     """In the error that it ends with, and in the bundle, however it ends while it loads.
-
-    The control is the same where nothing is recorded.
-    """
+    The control is the same where nothing is recorded."""
     text, kind, reason = _ENDINGS[ending]
     folder = write_repository(tmp_path / "ended", f"{_ENDED}\n{text}\n")
     for recorded in (True, False):
@@ -386,9 +378,7 @@ def test_what_is_denied_while_a_known_environment_is_built_is_told(tmp_path: Pat
 @pytest.mark.parametrize("profile", profiles("no-userns"))
 def test_who_is_seen_asking_gets_no_further(home: Path, profile: str) -> None:
     """The name that is looked at may be another than the one that is opened; the kernel decides.
-
-    The control is the same race without a sandbox.
-    """
+    The control is the same race without a sandbox."""
     foreign = home / "there"
     foreign.touch()
     foreign.chmod(0o666)

@@ -42,7 +42,6 @@ def attempt(profile: str) -> tuple[Mapping[str, Any], dict[str, str], str]:
 
 def test_a_jail_has_the_gpus_that_it_was_given(arena: Arena) -> None:
     """Their nodes and their own folders of /sys; no other GPU, and no name of a network device.
-
     What nobody counts is in the report; and a GPU that is not there is refused with those that are.
     """
     found, words, net = attempt(arena.profile)

@@ -211,10 +211,8 @@ WITHOUT_EFFECT = ("readahead", "sync_file_range", "utime")
 
 def test_rare_calls_do_not_reach_the_kernel(jail: OpenJail) -> None:
     """What a program of this kind never calls is answered by the filter: EPERM, ENOSYS, or success.
-
     These calls leave no trace outside, so their answers have to do: outside, the kernel looks at
-    the arguments and refuses those; inside, it is never asked.
-    """
+    the arguments and refuses those; inside, it is never asked."""
     with control_run("answers", {"calls": CALLS}) as run:
         outside = run.value
     with jail.inside("answers", {"calls": CALLS}) as run:

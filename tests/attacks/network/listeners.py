@@ -116,10 +116,8 @@ def listening(
 
 def sends(place: Attacks, title: str, payload: str, listener: Listener, **arguments: Any) -> None:
     """Attack with a message that ``listener`` must hear in the control, and never from inside.
-
     Each half has a message of its own: what the control sends a second time may still be on its
-    way when the inside begins.
-    """
+    way when the inside begins."""
     control, inside = token(), token()
 
     def heard(run: Run) -> bool:

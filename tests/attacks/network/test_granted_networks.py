@@ -55,9 +55,7 @@ def test_its_own_loopback_is_not_the_hosts(strict: Arena) -> None:
 
 def test_its_own_loopback_is_not_another_jails(strict: Arena) -> None:
     """A jail listens on a port, and so does the host: each hears only itself.
-
-    The host is the first: which of its ports are free, no jail knows.
-    """
+    The host is the first: which of its ports are free, no jail knows."""
     title, message = 'with network="loopback": TCP to another jail', token()
     with (
         listening(**TCP) as outside,
@@ -91,9 +89,7 @@ def test_nothing_is_served_from_its_own_loopback(strict: Arena) -> None:
 
 def test_the_hosts_network_is_no_more_than_tcp_and_udp(arena: Arena, home: Path) -> None:
     """Both arrive, since they were granted. Other protocols and socket files do not.
-
-    Netlink stays shut, too: no routes, neighbours, or rules of a firewall are asked for.
-    """
+    Netlink stays shut, too: no routes, neighbours, or rules of a firewall are asked for."""
     path = home / "service.sock"
     with arena.environment({"network": "host"}) as env:
         granted(env, "tcp", TCP)

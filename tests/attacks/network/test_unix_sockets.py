@@ -38,9 +38,7 @@ def test_socket_files_cannot_be_connected_to(
 
 def run_folder() -> Path:
     """A folder in /run for root, where docker's is; elsewhere for those who may not write there.
-
-    Its path is short: that of a socket has 108 bytes.
-    """
+    Its path is short: that of a socket has 108 bytes."""
     return Path("/run" if USER == "root" else "/var/tmp") / f"envhub-{token()[:8]}"
 
 

@@ -47,9 +47,7 @@ def fetched(archive: Path) -> Path:
 
 def test_a_size_below_zero_leads_nowhere(tmp_path: Path) -> None:
     """The last header leads back to the one before it: a reader that follows never ends.
-
-    An interpreter that has been mended refuses it, too; then there is no control.
-    """
+    An interpreter that has been mended refuses it, too; then there is no control."""
     data = header("x-1.0/a", 0) * 2 + header("x-1.0/b", -2 * _BLOCK)
     archive = archived(tmp_path, data + bytes(2 * _BLOCK))
     with contextlib.suppress(tarfile.TarError), tarfile.open(archive) as opened:

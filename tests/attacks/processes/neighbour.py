@@ -14,13 +14,7 @@ _GRACE_S, _PATIENCE_S = 0.5, 60.0
 
 @dataclass(frozen=True)
 class Neighbour:
-    """A live jail that holds a secret; the fields are a victim's.
-
-    Attributes:
-        env: Its environment.
-        secret: What it holds.
-        path: Its file that holds the secret, as the jail calls it.
-    """
+    """A live jail that holds a secret; the fields are a victim's."""
 
     env: Any
     secret: str

@@ -34,13 +34,7 @@ WHOSE = ["same user", *_OTHERS]
 
 @dataclass(frozen=True)
 class Stranger(Victim):
-    """A client of another process; the other fields are of its jail.
-
-    Attributes:
-        path: The file that holds the secret, as the jail calls it.
-        server: The folder of its worker server.
-        cache: Its store, with its crash bundles.
-    """
+    """A client of another process; the other fields are of its jail."""
 
     path: str
     server: str

@@ -94,9 +94,7 @@ def kill_group(alias: str) -> None:
 
 def test_nothing_outlives_the_client(arena: Arena) -> None:
     """When the client dies, the jail's daemons die with it.
-
-    ``tests/faults/remains`` ends clients in other ways: a server sees the same of each.
-    """
+    ``tests/faults/remains`` ends clients in other ways: a server sees the same of each."""
     alias = new_alias()
     words = json.dumps([str(HOSTILE), "daemon", {"alias": alias}, arena.profile])
     client = subprocess.Popen(

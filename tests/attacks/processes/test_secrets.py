@@ -30,9 +30,7 @@ def hub_token(home: Path, other_cache: Path, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.short("strict")
 def test_nothing_of_ours_has_the_token(arena: Arena, hub_token: str) -> None:
     """Neither the environments of what we start, nor any page of a jail's memory.
-
-    A worker is executed afresh, and never forked off the client.
-    """
+    A worker is executed afresh, and never forked off the client."""
     assert hub_token in os.environ.values()
     read = 0
     for process in psutil.Process().children(recursive=True):

@@ -21,16 +21,7 @@ _PR_SET_PTRACER = 0x59616D61
 
 @dataclass(frozen=True)
 class Victim:
-    """The tests' end.
-
-    Attributes:
-        process: What answers for it.
-        secret: What it holds.
-        pid: Its process.
-        address: Where in its memory the secret lies.
-        size: Length of the secret.
-        fd: Its descriptor of a file that holds the secret.
-    """
+    """The tests' end."""
 
     process: subprocess.Popen[str]
     secret: str
@@ -41,9 +32,7 @@ class Victim:
 
     def state(self) -> dict[str, Any]:
         """``text``, what its memory holds now; ``signals`` and ``broadcasts``, how many have come.
-
-        What is sent to everybody is another signal: it reaches victims of other tests, too.
-        """
+        What is sent to everybody is another signal: it reaches victims of other tests, too."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.write("\n")

@@ -193,9 +193,7 @@ def smuggled(song: bytes) -> list[list[Buffer]]:
 
 def test_pickles_never_execute(tmp_path: Path) -> None:
     """A pickle in any extension, array, frame or text is data or an error, and never runs.
-
-    The control: the same bytes do run in ``pickle.loads``, before and after.
-    """
+    The control: the same bytes do run in ``pickle.loads``, before and after."""
     before, canary, after = (tmp_path / name for name in ("before", "canary", "after"))
     pickle.loads(pickle.dumps(Canary(before)))
     song = pickle.dumps(Canary(canary))

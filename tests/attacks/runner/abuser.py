@@ -159,15 +159,7 @@ def abuser(folder: Path) -> Path:
 def watched(
     arena: Arena, folder: Path, acts: Sequence[str], *, every: bool = False, **order: Any
 ) -> tuple[bool, list[str]]:
-    """Whether a client whose environments do these came to its end, and what it said.
-
-    Args:
-        arena: Under which profile.
-        folder: For the repository.
-        acts: Functions of ``ABUSE``, one for each environment.
-        every: Whether it is done to every descriptor of the jail, and not to the doorbells alone.
-        **order: For ``held_client``.
-    """
+    """Whether a client whose environments do these came to its end, and what it said."""
     whole = {
         "acts": acts,
         "every": every,

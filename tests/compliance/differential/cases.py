@@ -24,15 +24,7 @@ Call = tuple[str, tuple[Any, ...], dict[str, Any]]
 
 @dataclass(frozen=True)
 class Case:
-    """What a number stands for.
-
-    Attributes:
-        env_fns: One for each sub-environment.
-        mode: The autoreset mode.
-        is_async: Whether the repository makes an ``AsyncVectorEnv``.
-        options: What else ``make_env`` is told.
-        observation_mode: How the sub-environments' spaces are taken together.
-    """
+    """What a number stands for."""
 
     number: int
     env_fns: list[Callable[[], gym.Env[Any, Any]]]
@@ -152,13 +144,7 @@ _OTHERS: dict[str, Callable[[Random, int], Call]] = {
 
 
 def difference(drawn: Case, number: int, further: dict[str, Any] | None = None) -> str | None:
-    """The first difference in words, or None if there is none in so many calls.
-
-    Args:
-        drawn: The case.
-        number: How many calls follow the first reset.
-        further: What else ``make_env`` is told: where to run it, for instance.
-    """
+    """The first difference in words, or None if there is none in so many calls."""
     modes: dict[str, Any] = {
         "autoreset_mode": drawn.mode,
         "observation_mode": drawn.observation_mode,
@@ -228,9 +214,7 @@ def _outcome(env: Any, call: Call, in_halves: bool = False) -> Any:
 
 def _same_failure(drawn: Case, name: str, expected: Any, actual: Any) -> bool:
     """Whether both failed alike, and what a call raised says the same.
-
-    That an episode is over is noticed in its own process, while another may fail by itself.
-    """
+    That an episode is over is noticed in its own process, while another may fail by itself."""
     if not isinstance(expected, Exception) or not isinstance(actual, Exception):
         return False
     if name == "step" and drawn.mode is AutoresetMode.DISABLED:

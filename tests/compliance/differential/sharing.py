@@ -26,12 +26,7 @@ _fresh = count()
 
 @dataclass(frozen=True)
 class Case:
-    """What a number stands for.
-
-    Attributes:
-        kwargs: Of the repository's ``make_env``: what is shared, among others.
-        options: Of ours.
-    """
+    """What a number stands for."""
 
     number: int
     n_envs: int
@@ -59,10 +54,8 @@ def case(number: int) -> Case:
 
 def difference(drawn: Case, number: int, further: dict[str, Any] | None = None) -> str | None:
     """The first difference in words, or None if there is none in so many calls.
-
     The sandbox is used twice: in its first use it has just been tried how many processes are used,
-    and in the second one that is remembered.
-    """
+    and in the second one that is remembered."""
     here = _module().make_env(drawn.n_envs, True, **drawn.kwargs)
     expected = _played(here, drawn, number)
     for use in ("first", "second"):

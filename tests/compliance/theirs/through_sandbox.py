@@ -43,14 +43,7 @@ def vector(
     options: dict[str, Any] | None = None,
     **kwargs: Any,
 ) -> SandboxVectorEnv:
-    """A vector environment of these functions, which are called in a sandbox.
-
-    Args:
-        env_fns: One for each sub-environment; they travel by cloudpickle.
-        use_async_envs: ``AsyncVectorEnv`` takes them there.
-        options: What else ``make_env`` is told; its ``env_kwargs`` are the repository's.
-        kwargs: What else Gymnasium's class is told.
-    """
+    """A vector environment of these functions, which are called in a sandbox."""
     env_fns = list(env_fns)
     options = dict(options or {})
     with by_value():

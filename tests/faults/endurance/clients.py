@@ -84,11 +84,7 @@ def _client(endpoint: str, server_key: str) -> int:
 
 
 class Server:
-    """A server on loopback.
-
-    Attributes:
-        place: Its folder for temporary files.
-    """
+    """A server on loopback."""
 
     def __init__(self, listens: Listening, place: Path) -> None:
         self._listens, self.place = listens, place
@@ -119,11 +115,7 @@ class Server:
         subprocess.run([*command, *words], check=True, env=os.environ | variables, timeout=600)
 
     def settled(self, before: Mapping[str, float] | None = None) -> dict[str, float]:
-        """What it has, once all clients have gone: waits for their ends, but not for ever.
-
-        Args:
-            before: What it had earlier; it is also waited for what is more than that.
-        """
+        """What it has, once all clients have gone: waits for their ends, but not for ever."""
         end, last = time.monotonic() + _SETTLE_S, dict[str, float]()
         while True:
             now = self._look()

@@ -56,9 +56,7 @@ def judged(
     folder: Path, *arguments: str | Path, reached: Callable[[], bool]
 ) -> tuple[int, dict[str, Any]]:
     """The exit code and the document of a check, whose alarm rings once this is reached.
-
-    Its files are left in the folder.
-    """
+    Its files are left in the folder."""
     files = [f"--{kind}={folder / kind}" for kind in ("junit", "sarif", "html")]
     words = ["check", "--json", *files, "--steps", "5", "--deadline", _LONG_S, *arguments]
     command = [sys.executable, "-I", "-m", "envhub_sandbox", *map(str, words)]

@@ -140,9 +140,7 @@ for sys.argv[1:] in json.loads(sys.argv[1]):
 def test_no_command_of_a_repository_is_obeyed(columns: int | None, each: int, place: Path) -> None:
     """By what every command prints to a narrow terminal, and some into a pipe; ours are, with
     ``--github``.
-
-    The control is the texts themselves, which all but those that cannot have them print.
-    """
+    The control is the texts themselves, which all but those that cannot have them print."""
     shutil.copytree(crashed(place), place / "bundle")
     variables = {"COLUMNS": "20", "GITHUB_STEP_SUMMARY": str(place / "summary")}
     told = 0

@@ -38,9 +38,7 @@ def test_the_pinned_commit_runs_again(
 
 def test_only_the_callers_own_bundle_needs_no_grant(tmp_path: Path) -> None:
     """Somebody else's opens no network, folder or repository of the caller's, unless he grants it.
-
-    What this program has written, where it writes bundles, is his own.
-    """
+    What this program has written, where it writes bundles, is his own."""
     bundle = crashed(tmp_path, sample("faulty"), policy={"network": "loopback"})
     refused = envhub("replay", bundle)
     assert refused.returncode == 2

@@ -263,9 +263,7 @@ def test_strict_forbids_what_the_kernel_counts_for_the_user(cells: dict[str, Cel
 @pytest.mark.short
 def test_capabilities_and_privileges_are_gone(cell: Cell) -> None:
     """As the kernel says it of the runner; an exec brings nothing back. Init has none either.
-
-    As root, the jail runs as a user that owns and runs nothing; never as uid 0.
-    """
+    As root, the jail runs as a user that owns and runs nothing; never as uid 0."""
     source = """
 import os, subprocess
 with open("/proc/self/status") as status:

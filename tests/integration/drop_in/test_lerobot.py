@@ -67,9 +67,7 @@ def test_evaluation_of_a_suite_is_the_same(
 ) -> None:
     """Metrics of every task agree, one by one and from a pool of threads; also a second time, for
     which what the first one closed is opened again. For a caller of Gymnasium it stays closed.
-
-    LeRobot's videos take a whole number of frames in a second; Gymnasium's take this one.
-    """
+    LeRobot's videos take a whole number of frames in a second; Gymnasium's take this one."""
     expected = lerobot.evaluate_all(make_env_of(repository)(n_envs=2), policy, 3, 1)
     for result in expected.values():
         result["fps"] = round(result["fps"])

@@ -189,9 +189,7 @@ def test_closing_what_is_being_given_up_leaves_no_server(tasks: Callable[..., Ta
 @pytest.fixture
 def gated(tmp_path: Path) -> tuple[Path, Path, dict[str, Any]]:
     """A repository whose task 1 is made once there is a file; the file; the policy to see it.
-
-    Its manifest is remembered.
-    """
+    Its manifest is remembered."""
     gate = tmp_path / "gate"
     gate.mkdir()
     gate.chmod(0o755)

@@ -126,9 +126,7 @@ def test_a_worker_is_brought_back_alone(gates: Gates) -> None:
 @lanes
 def test_a_step_may_take_too_long(gates: Gates) -> None:
     """Its worker is late, and is brought back by a reset; the others' results come.
-
-    Who has answered in time is not late, however long a learner thinks before it takes that.
-    """
+    Who has answered in time is not late, however long a learner thinks before it takes that."""
     env = gates.env(2)
     with inside.hurried_part(env, 1, step_s=2.0):
         send(env, 0, 0)

@@ -119,9 +119,7 @@ def test_an_operation_has_one_deadline(
     talker: Path, lane: str, restart: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However many shards have answers to be fetched: no fetch starts the clock anew.
-
-    Or else runners that answer at the last moment would make a step last as long as they please.
-    """
+    Or else runners that answer at the last moment would make a step last as long as they please."""
     made: list[float | None] = []
     initialize, running = Deadline.__init__, vars(StepDeadline)["running"]
 

@@ -62,10 +62,8 @@ def test_a_refusal_between_looking_and_sending_is_no_wait(
     server: Listening, repository: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The socket has nowhere to put the request then, and libzmq would wait for that for ever.
-
     In some of a hundred refusals libzmq goes on taking messages for a connection that it has given
-    up; the error is the same, and the next client gets the other kind.
-    """
+    up; the error is the same, and the next client gets the other kind."""
     whole = TcpLink.next_number
     had_no_room = False
 
@@ -151,9 +149,7 @@ _REFUSALS = 3
 
 def _handshakes(ends: zmq.Socket[bytes]) -> list[bool]:
     """Whether it was let in: once, or in none of several tries.
-
-    A handler's socket is closed by a thread of libzmq's. A handshake that still finds it fails.
-    """
+    A handler's socket is closed by a thread of libzmq's. A handshake that still finds it fails."""
     for _ in range(_REFUSALS):
         assert ends.poll(60_000)
         if parse_monitor_message(ends.recv_multipart())["event"] != zmq.EVENT_DISCONNECTED:

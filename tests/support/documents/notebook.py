@@ -16,11 +16,7 @@ DOCUMENT = CHECKOUT / "examples" / "quickstart.ipynb"
 
 
 def executed() -> dict[str, Any]:
-    """The notebook with the outputs of an execution in this process, which IPython then owns.
-
-    Raises:
-        Exception: What a cell raises.
-    """
+    """The notebook with the outputs of an execution in this process, which IPython then owns."""
     from IPython.core.interactiveshell import InteractiveShell
     from IPython.utils.capture import capture_output
     from traitlets.config import Config

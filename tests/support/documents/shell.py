@@ -107,15 +107,7 @@ def executed(document: str) -> list[Block]:
 def execute(
     blocks: Iterable[Block], hub: StubHub, folder: Path, within: str = "", docker: str = _DOCKER
 ) -> str:
-    """Execute blocks of shell and Python; returns what they print.
-
-    Args:
-        blocks: In their order.
-        hub: Has ``org/repo`` at two commits from then on.
-        folder: Empty; what is made is below it.
-        within: The repository that the reader has gone into, instead of the checkout.
-        docker: The script that is found by that name.
-    """
+    """Execute blocks of shell and Python; returns what they print."""
     clone = folder / "clone"
     shutil.copytree(CHECKOUT / "examples", clone / "examples")
     shutil.copy(CHECKOUT / "pyproject.toml", clone)

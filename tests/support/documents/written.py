@@ -7,11 +7,7 @@ DOCS = Path(__file__).resolve().parents[3] / "docs"
 
 
 def filled(document: Path, **parts: str) -> str:
-    """The document with these texts between ``<!-- NAME -->`` and ``<!-- /NAME -->``.
-
-    Raises:
-        ValueError: There is not one place of that name in it.
-    """
+    """The document with these texts between ``<!-- NAME -->`` and ``<!-- /NAME -->``."""
     text = document.read_text()
     for name, lines in parts.items():
         place = re.compile(rf"(?<=^<!-- {name} -->\n).*(?=^<!-- /{name} -->$)", re.M | re.S)

@@ -12,13 +12,7 @@ Frames = Sequence[Any]
 
 
 class FakeServer:
-    """What a ``JailHandle`` uses of a ``WorkerConnection``.
-
-    Attributes:
-        sent: Each relay that went out, and its frames.
-        ids: Theirs.
-        refuses: Raised where the next one is sent.
-    """
+    """What a ``JailHandle`` uses of a ``WorkerConnection``."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[m.Relay, Frames]] = []

@@ -18,10 +18,8 @@ def before_line(file: str | None, line: int, act: Callable[[], object]) -> bool:
 
 def at_call(moment: int, act: Callable[[], object]) -> bool:
     """Do it, with a Ctrl-C at the ``moment``-th call of the client's own; whether one came.
-
     Python looks for signals where a function begins. One that comes into a finaliser is printed,
-    and goes no further.
-    """
+    and goes no further."""
     return _at(moment, "call", lambda name: name.startswith(_OURS), act)
 
 

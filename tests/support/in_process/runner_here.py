@@ -19,16 +19,7 @@ from envhub_worker.runner.runner import Runner
 
 
 class RunnerHere:
-    """A runner of one repository, whose modules can be imported until the end of a ``with``.
-
-    Args:
-        folder: Of the repository.
-        n_envs: For its ``make_env``.
-        entry: Its entry file.
-
-    Attributes:
-        manifest: Of the first task, of which all sub-environments are built as number 1.
-    """
+    """A runner of one repository, whose modules can be imported until the end of a ``with``."""
 
     def __init__(self, folder: Path, n_envs: int = 2, entry: str = "env.py") -> None:
         self._before = set(sys.modules), list(sys.path), sys.dont_write_bytecode

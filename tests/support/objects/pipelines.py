@@ -66,11 +66,7 @@ def one_by_one(env: Any) -> list[Any]:
 
 
 def several_at_once(env: Any, look: Callable[[], object] = lambda: None) -> list[Any]:
-    """The same steps; of most parts, several are sent before the first is received.
-
-    Args:
-        look: Called when a part has come to its end.
-    """
+    """The same steps; of most parts, several are sent before the first is received."""
     came = []
     for depth, part in zip(_DEPTHS, _actions(env), strict=True):
         if not depth:

@@ -28,12 +28,7 @@ HOSTILE = (
 
 
 class Page(HTMLParser):
-    """Its tags with their attributes, and its text.
-
-    Attributes:
-        tags: In their order.
-        text: What stands between them.
-    """
+    """Its tags with their attributes, and its text."""
 
     def __init__(self, source: str) -> None:
         super().__init__(convert_charrefs=True)

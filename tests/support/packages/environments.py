@@ -26,13 +26,7 @@ def base_interpreter() -> str:
 
 
 def install(folder: Path, *requirements: str, built: str | None = None) -> Runtime:
-    """``requirements``, and what the worker needs, as wheels for this interpreter.
-
-    Args:
-        folder: Where to.
-        requirements: As pip takes them.
-        built: The one package that has no wheels, and is built of its source.
-    """
+    """``requirements``, and what the worker needs, as wheels for this interpreter."""
     for numpy, newest in {"1.26.4": (3, 12), "1.23.5": (3, 11)}.items():
         if sys.version_info[:2] > newest and f"numpy=={numpy}" in requirements:
             pytest.skip(f"numpy {numpy} has wheels up to Python 3.{newest[1]}")

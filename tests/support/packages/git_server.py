@@ -57,9 +57,7 @@ def git_served(
     root: Path, rewritten: Callable[[bytes], bytes] = lambda body: body
 ) -> Iterator[str]:
     """Serve the repositories in a folder; gives the URL that their names follow.
-
-    ``rewritten`` is what a lying server makes of a request before it answers.
-    """
+    ``rewritten`` is what a lying server makes of a request before it answers."""
 
     class Handler(QuietHandler):
         def do_GET(self) -> None:

@@ -49,15 +49,7 @@ def backend(
     needs: Sequence[str] = (),
     further: str = "",
 ) -> dict[str, str]:
-    """The files of sources that build themselves.
-
-    Args:
-        name: The package that comes out.
-        version: Its version.
-        requires: What it needs once it is installed.
-        needs: What it is built with.
-        further: Python, run with the backend.
-    """
+    """The files of sources that build themselves."""
     text = BACKEND.format(name=name, version=version, requires=list(requires))
     needed = ", ".join(map(repr, needs))
     return {"backend.py": text + further, "pyproject.toml": PYPROJECT.format(needs=needed)}

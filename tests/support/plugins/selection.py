@@ -32,11 +32,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what is not in the short form, and with ``--one-case`` all but first cases.
-
-    Raises:
-        UsageError: A marker names cases of which there is none.
-    """
+    """Leave out what is not in the short form, and with ``--one-case`` all but first cases."""
     kept = list(items)
     if is_short(config):
         if idle := sorted(_named(items) - _named(items, met=True)):

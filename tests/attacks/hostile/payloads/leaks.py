@@ -53,9 +53,7 @@ def inherited_descriptors():
 
 def own_memory(prefix):
     """Search all of this process's memory for something that looks like the token.
-
-    A fork of the client would hold it, however well its environment was scrubbed.
-    """
+    A fork of the client would hold it, however well its environment was scrubbed."""
     pattern = re.compile(prefix.encode() + rb"[0-9a-f]{32}")
     found = set()
     memory = os.open("/proc/self/mem", os.O_RDONLY)

@@ -116,9 +116,7 @@ def remount_root(alias):
 
 def answers(calls):
     """Call parts of the kernel that such a program never needs, with arguments that do nothing.
-
-    What comes back tells whether the call got there.
-    """
+    What comes back tells whether the call got there."""
     answers = {}
     for name, arguments in calls.items():
         if number(name) is None:
@@ -174,9 +172,7 @@ _MAKERS = {
 
 def foreign_abi(alias, abi):
     """Call the kernel by another architecture's numbers: a filter that forgets to check is blind.
-
-    The call sets this process's name, which shows from outside.
-    """
+    The call sets this process's name, which shows from outside."""
     if platform.machine() != "x86_64":
         raise OSError("this machine has no other architecture's numbers")
     kind = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | _MAP_32BIT

@@ -41,9 +41,7 @@ def signal_one(pid, way):
 
 def signal_all():
     """Send a signal to every process that may be reached: one that nobody minds.
-
-    It is not the one that those who are attacked one by one count.
-    """
+    It is not the one that those who are attacked one by one count."""
     os.kill(-1, signal.SIGWINCH)
 
 
