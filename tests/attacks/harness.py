@@ -253,8 +253,6 @@ def control_run(payload: str, arguments: Mapping[str, Any], secret: str = "") ->
 def answered(process: subprocess.Popen[bytes], run: Run, secret: str = "") -> Iterator[None]:
     """Note what ``hostile/outside.py`` answers in a process, which lives as long as the context."""
     try:
-        assert process.stdin is not None
-        assert process.stdout is not None
         process.stdin.write(secret.encode() + b"\n")
         process.stdin.flush()
         answer = _last_line(process)
@@ -281,7 +279,6 @@ def start_control(
 
 def _last_line(process: subprocess.Popen[bytes]) -> dict[str, Any]:
     """The runner's line of JSON; whatever the payload prints comes before it."""
-    assert process.stdout is not None
     for line in process.stdout:
         if line.startswith(b'{"value"'):
             return dict(json.loads(line))

@@ -56,9 +56,7 @@ class Pair:
 
     @property
     def autoreset_mode(self) -> AutoresetMode:
-        mode = self.reference.metadata["autoreset_mode"]
-        assert isinstance(mode, AutoresetMode)
-        return mode
+        return self.reference.metadata["autoreset_mode"]
 
 
 def _copied(kwargs: dict[str, Any]) -> dict[str, Any]:

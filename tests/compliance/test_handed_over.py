@@ -82,9 +82,7 @@ def env(folder: Path) -> Iterator[SandboxVectorEnv]:
 
 
 def made_of(folder: Path, **kwargs: Any) -> SandboxVectorEnv:
-    env = make_env(folder, **kwargs).env
-    assert isinstance(env, SandboxVectorEnv)
-    return env
+    return make_env(folder, **kwargs).env
 
 
 LARGE = ("long list", "long text", "many bytes")

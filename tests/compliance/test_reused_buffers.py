@@ -69,8 +69,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _here(folder: Path) -> Any:
     spec = importlib.util.spec_from_file_location("reuses", folder / "env.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -124,7 +124,6 @@ def test_without_a_volume_a_read_only_container_serves_and_forgets(engine: Engin
         try:
             wait_until_it_serves(engine, container)
             said = re.search(r"public key: (\w{64})", engine.run("logs", container))
-            assert said is not None
             found.add(said[1])
         finally:
             engine.run("rm", "--force", container)

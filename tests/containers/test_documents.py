@@ -67,7 +67,6 @@ def test_the_blocks_about_containers_run(
     """Shell and Python, one after the other; the server that is started there runs then."""
     assert {one.language for one in ours(document)} == languages
     name, command = f"envhub-test-{secrets.token_hex(6)}", shutil.which(engine.command)
-    assert command is not None
     script, image = shlex.quote(command), shlex.quote(IMAGE)
     checkout = shlex.quote(str(blocks.CHECKOUT))
     docker = _DOCKER.format(engine=script, image=image, name=name, checkout=checkout)

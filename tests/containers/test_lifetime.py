@@ -81,8 +81,6 @@ def client(engine: Engine, then: str = "wait") -> Iterator[Client]:
         text=True,
         start_new_session=True,
     )
-    assert process.stdin is not None
-    assert process.stdout is not None
     try:
         said = json.loads(process.stdout.readline())
         container = said["report"][0].rpartition(", ")[2]

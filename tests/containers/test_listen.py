@@ -29,7 +29,6 @@ def served(engine: Engine, *options: str) -> Iterator[dict[str, Any]]:
     try:
         assert eventually(lambda: "ENVHUB_CLIENT_KEY" in engine.run("logs", container))
         line = re.search(r"^  sandbox=envhub_sandbox\.(.*)$", engine.run("logs", container), re.M)
-        assert line is not None
         port = engine.run("port", container, "5555").split()[0].rpartition(":")[2]
         printed = line[1].replace("tcp://127.0.0.1:5555", f"tcp://127.0.0.1:{port}")
         yield eval(f"dict(sandbox={printed})", {"RemoteSandbox": RemoteSandbox})

@@ -68,7 +68,6 @@ def test_a_second_ctrl_c_in_recovery_leaves_a_usable_environment(
             patch.setattr(*inside.ending(env), interrupted)
             with pytest.raises(KeyboardInterrupt):
                 env.reset()
-        assert first is not None
         assert first.closed
         assert inside.state(env) is State.LATE
         env.reset()
@@ -181,7 +180,6 @@ def test_close_ends_the_wait_before_a_restart(
                 env.step([0, 1])
         monkeypatch.setattr(failures, "backoff_s", waiting)
         loaded = inside.loaded(env)
-        assert loaded is not None
         thread, raised = threaded(env.reset if restart == "on_reset" else lambda: env.step([0, 1]))
         waiting.wait()
         env.close()
@@ -302,7 +300,6 @@ def test_closed_in_the_midst_says_closed(operation: str, lane: str, before: bool
     event, ask = OPERATIONS[operation]
     with begun(lane) as env:
         loaded = inside.loaded(env)
-        assert loaded is not None
         inside.live_by(env, Closing(env, event, before=before))
         with pytest.raises(ClosedEnvironmentError):
             ask(env)

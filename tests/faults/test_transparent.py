@@ -375,7 +375,6 @@ def test_the_end_of_the_jail_takes_all_rows(env: Any) -> None:
     jail = inside.jail(env).number
     runners = inside.pids(env)
     init = psutil.Process(runners[0]).parent()
-    assert init is not None
     init.kill()
     assert eventually(lambda: not any(map(psutil.pid_exists, runners)))
     observation, _, _, truncated, info = env.step(ALL_LIVE)
@@ -533,5 +532,4 @@ def test_the_dead_leave_nothing_in_their_jail() -> None:
         # what others left may be closed meanwhile, and what a thread has open just now
         assert eventually(lambda: len(os.listdir("/proc/self/fd")) <= held)
         init = psutil.Process(inside.pids(env)[0]).parent()
-        assert init is not None
         assert eventually(lambda: len(init.children(recursive=True)) == 2)

@@ -32,8 +32,6 @@ class Slabs:
     def __init__(self) -> None:
         observed = slabs.observation_layout(SPACE, COUNT, 1)
         layout = slabs.layout_of(spaces.Discrete(2), COUNT)
-        assert observed is not None
-        assert layout is not None
         self.observations = ObservationSlab(SPACE, observed)
         self.shard = LaneShard(layout, self.observations.fd)
         self.slots = SlotRing(1, slabs.INFO_BYTES, slabs.INFO_BYTES)

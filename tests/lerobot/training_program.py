@@ -41,8 +41,6 @@ class OfThisProcess(EnvConfig):
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, Any]:
         """What the file's ``make_env`` returns."""
         spec = spec_from_file_location("env_of_this_process", self.file)
-        assert spec is not None
-        assert spec.loader is not None
         module = module_from_spec(spec)
         spec.loader.exec_module(module)
         return {"hub_env": {0: module.make_env(n_envs, use_async_envs)}}

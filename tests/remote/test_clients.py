@@ -68,7 +68,6 @@ def test_another_clients_jail_is_not_there(alice: Any, mallory: Peer) -> None:
     assert isinstance(mallory.ask(m.CloseJail(jail.number)), m.Done)
     assert jail.output("", Deadline(60)) is not None
     status = mallory.ask(m.GetStatus())
-    assert isinstance(status, m.Status)
     assert status.jails == ()
 
 
@@ -132,7 +131,6 @@ def test_what_breaks_a_rule_is_refused(alice: Any, mallory: Peer) -> None:
         assert "is no request" in mallory.refused(message).message
     assert "too long" in mallory.refused(m.Hello(m.VERSION, b"n" * 65)).message
     shown = mallory.ask(m.GetSessions())
-    assert isinstance(shown, m.Sessions)
     assert {one["client"] for one in shown.sessions if isinstance(one, dict)} == {"mallory"}
     assert set(shown.server["clients"]) == {"mallory"}
     assert shown.server.keys().isdisjoint({"pid", "disk", "connections"}), "the operator's"

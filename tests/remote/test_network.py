@@ -174,7 +174,6 @@ def test_a_killed_clients_jails_end(impatient: Listening, repository: Path) -> N
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
-    assert client.stdout is not None
     assert client.stdout.readline() == b"ready\n"
     assert impatient.jails() == 1
     os.kill(client.pid, signal.SIGKILL)

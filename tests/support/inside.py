@@ -62,14 +62,12 @@ Spot = tuple[Any, str]
 
 def session(env: Any) -> EnvSession:
     """What lies behind the Gymnasium face of an environment."""
-    found: EnvSession = env._session
-    return found
+    return env._session
 
 
 def parts(env: Any) -> list[EnvSession]:
     """The workers of an environment that is spread over several."""
-    found: list[EnvSession] = env._session.parts
-    return found
+    return env._session.parts
 
 
 def leases(env: Any) -> list[Lease]:
@@ -164,7 +162,6 @@ def hurried_part(env: Any, worker: int, **timeouts: float) -> Iterator[None]:
 def part_pids(part: EnvSession) -> list[int]:
     """The processes of one worker's jail; asked over a connection of its own."""
     at = part.lease._at()
-    assert at is not None
     return list(part.lease._launcher.status(*at, 60.0)["pids"])
 
 
@@ -198,8 +195,7 @@ def use_lock_of(part: EnvSession) -> Any:
 
 def recipe(suites: Any) -> Recipe | None:
     """What a pickle of these suites holds."""
-    found: Recipe | None = suites._recipe
-    return found
+    return suites._recipe
 
 
 # --- where it lives ----------------------------------------------------------------------------
@@ -230,14 +226,12 @@ def users(env: Any) -> int:
 def pids(env: Any) -> list[int]:
     """The processes of its jail, as its server knows them."""
     status, _ = client(env).request(m.GetStatus(), deadline=Deadline(60))
-    assert isinstance(status, m.Status)
     jails = [one for one in status.jails if isinstance(one, dict)]
     return next(list(one["pids"]) for one in jails if one["jail"] == jail(env).number)
 
 
 def jails(env: Any) -> int:
     status, _ = client(env).request(m.GetStatus(), deadline=Deadline(60))
-    assert isinstance(status, m.Status)
     return len(status.jails)
 
 
@@ -396,7 +390,6 @@ def is_own_group(path: Path) -> bool:
 
 
 def zygote_pid(spawner: Spawner) -> int:
-    assert spawner._process is not None
     return spawner._process.pid
 
 
@@ -426,7 +419,6 @@ def gate_of(options: Any, folder: Path, identity: Identity) -> Any:
 
 def public_key(gate: RemoteGate) -> bytes:
     keys = gate._rules.keys
-    assert keys is not None
     return keys.public
 
 

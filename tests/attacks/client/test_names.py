@@ -92,7 +92,6 @@ class Naive:
 
         def method(*args: Any, **kwargs: Any) -> Any:
             result = self._ask(m.CallOwn, name, args, kwargs)
-            assert isinstance(result, m.Value)
             return result.value
 
         return method

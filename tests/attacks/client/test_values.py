@@ -74,7 +74,6 @@ def test_specs_make_nothing_here(
     canary = tmp_path / "made"
     with specified(liar, folder, spec_of(canary)) as suites:
         spec = suites.env.spec
-        assert spec is not None
         assert (spec.id, spec.max_episode_steps) == ("Hub-v0", 7)
         assert not spec.additional_wrappers
         spec.kwargs.pop("sandbox")  # that of the test, which JSON has no form for

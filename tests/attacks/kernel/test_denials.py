@@ -73,7 +73,6 @@ def test_a_recorded_jail_is_refused_the_same(tmp_path: Path) -> None:
         assert env.sandbox.denials() is None, "it does not run any more"
     assert 0 not in answers[True][0]
     assert answers[True] == answers[False]
-    assert told is not None
     assert attempts(told) == ["mount", "ptrace", "socket AF_INET", "unshare"]
 
 
@@ -132,7 +131,6 @@ def test_who_names_a_process_that_is_not_its_own_is_told(home: Path, profile: st
     assert answers[True] == answers[False]
     assert told[False] is None
     assert attempts(told[True] or ()) == []
-    assert after is not None
     assert attempts(after) == [
         "kill OTHER_PROCESS",
         f"read /proc/{_NOBODY}/cmdline",
@@ -279,7 +277,6 @@ def test_files_that_are_asked_for_are_told(tmp_path: Path) -> None:
         "rename /home/other/b",
         "read /root/.netrc",
     )
-    assert after is not None
     assert "unshare" in after
     assert len([one for one in after if "/" in one]) == 32
     assert len([one for one in after if " AF_" in one]) == 32
@@ -329,7 +326,6 @@ def test_what_ends_a_jail_tells_what_it_was_denied(ending: str, tmp_path: Path) 
         assert error.denied == expected
         assert getattr(error, "reason", "") == reason
         if isinstance(error, WorkerDiedError):
-            assert error.bundle is not None
             written = json.loads((Path(error.bundle) / "bundle.json").read_text())["denied"]
             assert written == (list(expected) if expected else None)
 

@@ -30,7 +30,6 @@ def nodes_of_drivers() -> list[str]:
 def offered(text: str) -> Iterator[str]:
     command = [sys.executable, str(HOSTILE / "payloads" / "use_card.py"), text]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
         yield process.stdout.readline().decode().strip()
         process.kill()
 

@@ -66,8 +66,6 @@ def test_a_flood_of_warnings_is_small_plain_and_ours(home: Path, lane: str) -> N
     """Here they flood, paint, and name a file, of which Python shows a line; there none does."""
     folder = write_environment(home / "flooder", _ENV)
     spec = importlib.util.spec_from_file_location("flooder", folder / "env.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     control = told_by(module.make_env)

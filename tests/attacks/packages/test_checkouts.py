@@ -87,7 +87,6 @@ def test_a_checkout_does_not_say_which_folder_is_looked_at(
     assert checkout.git(*listing, ":/") == "secret.txt"
     (checkout.folder / "new.py").write_text("")
     found = read_checkout(checkout.folder)
-    assert found is not None
     assert found.files == {"env.py", "far/data.txt", "new.py", "sub/x.py"}
 
 
@@ -101,5 +100,4 @@ def test_what_is_ignored_cannot_hold_the_client(checkout: GitRepository) -> None
     with pytest.raises(subprocess.TimeoutExpired):
         subprocess.run(command, capture_output=True, check=False, timeout=1)
     found = read_checkout(checkout.folder)
-    assert found is not None
     assert "hidden.py" not in found.files

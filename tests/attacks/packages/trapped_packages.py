@@ -63,8 +63,6 @@ def real_packages(folder: Path) -> None:
     folder.mkdir()
     for name in REAL:
         spec = importlib.util.find_spec(name)
-        assert spec is not None
-        assert spec.origin is not None
         origin = Path(spec.origin)
         place = origin.parent if origin.name == "__init__.py" else origin
         copy_of(place, folder / place.name)
@@ -81,7 +79,6 @@ def set_traps(folder: Path, home: Path) -> None:
         (folder / f"{name}.py").write_text(trap(home, name))
     for name in STANDARD:
         module = sys.modules.get(name) or importlib.import_module(name)
-        assert module.__file__ is not None
         copy_of(Path(module.__file__).parent, folder / name)
     (folder / "envhub_worker").mkdir()
     (folder / "envhub_worker" / "__init__.py").touch()

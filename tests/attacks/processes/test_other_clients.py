@@ -61,7 +61,6 @@ def stranger(arena: Arena, title: str, folder: Path, secret: str) -> Iterator[St
             "PYTHONDONTWRITEBYTECODE": "1",
         },
     )
-    assert process.stdout is not None
     try:
         yield Stranger(process, secret, **json.loads(process.stdout.readline()))
     finally:

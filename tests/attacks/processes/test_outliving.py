@@ -103,7 +103,6 @@ def test_nothing_outlives_the_client(arena: Arena) -> None:
         cwd=Path(__file__).parents[3],
     )
     try:
-        assert client.stdout is not None
         assert client.stdout.readline() == b"attacked\n"
         assert eventually(lambda: bool(pids_named(alias)))
         client.kill()

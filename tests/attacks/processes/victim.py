@@ -33,8 +33,6 @@ class Victim:
     def state(self) -> dict[str, Any]:
         """``text``, what its memory holds now; ``signals`` and ``broadcasts``, how many have come.
         What is sent to everybody is another signal: it reaches victims of other tests, too."""
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
         self.process.stdin.write("\n")
         self.process.stdin.flush()
         return dict(json.loads(self.process.stdout.readline()))
@@ -61,7 +59,6 @@ def victim(secret: str) -> Iterator[Victim]:
         text=True,
         env={"SECRET": secret},
     )
-    assert process.stdout is not None
     try:
         yield Victim(process, secret, **json.loads(process.stdout.readline()))
     finally:

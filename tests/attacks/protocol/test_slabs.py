@@ -34,7 +34,6 @@ SLOT = 1 << 16
 def observations() -> Iterator[ObservationSlab]:
     space = spaces.Box(0, 1, (8,), np.bool_)
     layout = slabs.observation_layout(space, 2, 1)
-    assert layout is not None
     made = ObservationSlab(space, layout)
     yield made
     made.close()
@@ -43,7 +42,6 @@ def observations() -> Iterator[ObservationSlab]:
 @pytest.fixture
 def shard(observations: ObservationSlab) -> Iterator[LaneShard]:
     layout = slabs.layout_of(spaces.Box(-1, 1, (2,)), 2)
-    assert layout is not None
     made = LaneShard(layout, observations.fd)
     yield made
     made.close()
@@ -266,7 +264,6 @@ def test_the_answer_to_a_step_is_copied_before_it_is_looked_at(
     size: int | None, spoiled: bytes, refusal: str
 ) -> None:
     layout = slabs.message_layout(spaces.Box(-1, 1, (2,)), 2)
-    assert layout is not None
     ring = SlotRing(1, SLOT, SLOT)
     shard = LaneShard(layout, ring.fd)
     shard.write_message(m.pack(m.Step(1, np.zeros((2, 2)))), (0, 0, 0), ring)
@@ -285,7 +282,6 @@ def test_the_answer_to_a_step_is_copied_before_it_is_looked_at(
     else:
         answer = shard.answer()
         attack(shard, f"os.pwrite(observations, bytes({SLOT}), 0)")
-        assert isinstance(answer, m.Value)
         assert answer.value.all()
     shard.close()
     ring.close()

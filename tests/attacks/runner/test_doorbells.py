@@ -45,7 +45,6 @@ def test_a_shared_description_holds_its_writer(tmp_path: Path) -> None:
         [sys.executable, "-c", ring], pass_fds=[bell], stdout=subprocess.PIPE
     ) as writer:
         try:
-            assert writer.stdout is not None
             assert writer.stdout.readline() == b"rings\n"
             assert not eventually(lambda: writer.poll() is not None, 3), "the control failed"
             os.read(bell, 8)  # it is the counter that held it, and nothing else

@@ -73,8 +73,6 @@ def _module() -> Any:
     """The repository's module, as a process sees it that has just imported it."""
     path = REPOSITORY / "env.py"
     spec = importlib.util.spec_from_file_location(f"sharing_{next(_fresh)}", path)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

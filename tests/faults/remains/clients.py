@@ -41,7 +41,6 @@ def start(folder: Path, body: str) -> subprocess.Popen[str]:
 
 
 def line(client: subprocess.Popen[str]) -> str:
-    assert client.stdout is not None
     return client.stdout.readline().strip()
 
 

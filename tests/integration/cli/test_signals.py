@@ -98,7 +98,6 @@ def test_a_terminal_sees_progress_and_a_pipe_gets_the_results() -> None:
         with contextlib.suppress(OSError):  # EIO: the other end is closed
             while chunk := os.read(controller, 65536):
                 seen += chunk
-        assert process.stdout is not None
         out = process.stdout.read()
     os.close(controller)
     assert process.returncode == 0

@@ -439,7 +439,6 @@ def test_its_spec_makes_it_again(tmp_path: Path) -> None:
     options: dict[str, Any] = {"policy": policy, "timeouts": {"step_s": 50.0}, "copy": False}
     with contextlib.closing(SandboxEnv(folder, token="hf_secret", **options)) as env:
         spec = env.spec
-        assert spec is not None
         assert (spec.id, spec.max_episode_steps, spec.reward_threshold) == ("Hub-v0", 500, 475.0)
         assert spec.nondeterministic is False
         assert spec.kwargs["policy"] == policy

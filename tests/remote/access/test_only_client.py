@@ -35,7 +35,6 @@ def announcing(public: str, state: Path) -> Iterator[tuple[subprocess.Popen[str]
         stderr=subprocess.DEVNULL,
         text=True,
     )
-    assert process.stdout is not None
     with process:
         try:
             yield process, {**json.loads(process.stdout.readline()), "endpoint": words[1]}
@@ -85,7 +84,6 @@ def test_it_ends_with_its_stdin(
 ) -> None:
     """As when the program that started it is killed; no key of a client was made."""
     process, _ = announced
-    assert process.stdin is not None
     assert process.poll() is None
     process.stdin.close()
     assert process.wait(60) == 0

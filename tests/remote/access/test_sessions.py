@@ -58,7 +58,6 @@ def connected(server: Listening) -> bool:
 def at_work(server: Listening, repository: Path) -> Iterator[subprocess.Popen[bytes]]:
     assert eventually(lambda: not connected(server))  # whoever was there before is known to be gone
     client = program(server, repository, "waits")
-    assert client.stdout is not None
     assert client.stdout.readline() == b"ready\n"
     yield client
     client.communicate(timeout=120)

@@ -118,7 +118,6 @@ def test_ctrl_c_interrupts_a_step(system: str, server: Listening, tmp_path: Path
         text=True,
     )
     with process:
-        assert process.stdout is not None
         assert process.stdout.readline() == "steps\n"
         time.sleep(0.5)  # so that it waits; sooner is an interrupt, too
         process.send_signal(signal.SIGINT)
@@ -138,7 +137,6 @@ def test_ctrl_c_ends_a_command(system: str, server: Listening, tmp_path: Path) -
         env={**os.environ, **variables(server)},
     )
     with process:
-        assert process.stderr is not None
         while "opened" not in process.stderr.readline():
             assert process.poll() is None
         process.send_signal(signal.SIGINT)

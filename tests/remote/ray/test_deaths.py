@@ -100,7 +100,6 @@ def test_a_killed_driver_leaves_nothing(cluster: Any, repository: Path, tmp_path
 def start_driver(address: str, repository: Path) -> subprocess.Popen[str]:
     command = [sys.executable, "-c", DRIVER, address, str(repository)]
     driver = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert driver.stdout is not None
     assert json.loads(driver.stdout.readline()) == "made"
     return driver
 
