@@ -205,8 +205,7 @@ def test_facts(make: Make, mode: AutoresetMode) -> None:
     env = make(carts(2), autoreset_mode=mode)
     assert env.metadata["autoreset_mode"] is mode
     assert "autoreset_mode" not in env.envs[0].metadata
-    assert env.num_envs == 2
-    assert env.get_attr("gravity") == (9.8, 9.8)
+    assert (env.num_envs, env.get_attr("gravity")) == (2, (9.8, 9.8))
 
 
 def test_the_arguments_can_be_read() -> None:

@@ -199,8 +199,7 @@ def test_its_attributes_methods_and_frames(runtimes: Any) -> None:
     ):
         warnings.simplefilter("ignore")
         env = suites.env
-        assert env.metadata["render_fps"] == 20
-        assert env.render_mode == "rgb_array"
+        assert (env.metadata["render_fps"], env.render_mode) == (20, "rgb_array")
         env.reset(seed=1)
         first = env.call("distance", scale=2)
         env.set_attr("gain", 0.0)

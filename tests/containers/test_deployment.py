@@ -185,8 +185,7 @@ def test_the_pods_of_the_ray_cluster_are_what_kubernetes_takes(
     groups = [cluster["spec"]["headGroupSpec"], *cluster["spec"]["workerGroupSpecs"]]
     named = {"apiVersion": "v1", "kind": "Pod"}
     pods = [named | one["template"] | {"metadata": {"name": "pod"}} for one in groups]
-    assert len(pods) == 2
-    assert code(*others, *pods) == 0
+    assert (len(pods), code(*others, *pods)) == (2, 0)
     pods[1]["spec"]["hostUser"] = pods[1]["spec"].pop("hostUsers")
     assert code(*others, *pods) != 0
 

@@ -34,8 +34,7 @@ def test_the_image_holds_the_worker_and_nothing_of_the_client(engine: Engine) ->
 
 def test_the_image_says_what_it_is(engine: Engine) -> None:
     config = inspected(engine, IMAGE)["Config"]
-    assert config["Entrypoint"] == ["envhub-worker"]
-    assert config["User"] == "65532:65532"
+    assert (config["Entrypoint"], config["User"]) == (["envhub-worker"], "65532:65532")
     assert config["Healthcheck"]["Test"] == ["CMD", "envhub-worker", "health"]
     assert config["Labels"]["org.opencontainers.image.title"] == "envhub-worker"
 

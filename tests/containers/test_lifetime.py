@@ -96,8 +96,7 @@ def client(engine: Engine, then: str = "wait") -> Iterator[Client]:
 def test_closing_leaves_nothing(docker: DockerSandbox, engine: Engine) -> None:
     assert nothing_left(engine)  # of others that linger
     with started(sample("counter"), sandbox=docker, seed=0):
-        assert len(containers_of(engine, os.getpid())) == 1
-        assert len(folders()) == 1
+        assert (len(containers_of(engine, os.getpid())), len(folders())) == (1, 1)
     assert nothing_left(engine)
     assert folders() == []
     assert not [pid for pid in descendants() if "monitor.py" in _command(pid)]

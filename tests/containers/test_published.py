@@ -72,8 +72,7 @@ def published(engine: Engine) -> DockerSandbox:
 
 
 def inspected(engine: Engine, container: str) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(engine.run("inspect", container))[0]
-    return found
+    return json.loads(engine.run("inspect", container))[0]
 
 
 @pytest.mark.parametrize("system", SYSTEMS)

@@ -67,8 +67,7 @@ def test_a_replay_dies_at_the_same_step(
         error = play(env)
     assert f"envhub replay {error.bundle}" in str(error)
     found = document("replay", "--grant", str(error.bundle))
-    assert found["verdict"] == "same"
-    assert found["changed_files"] == []
+    assert (found["verdict"], found["changed_files"]) == ("same", [])
     assert found["replayed"]["requests"] == found["recorded"]["requests"] > 10
     # the luck that it died with, to the last digit: chance has gone the same way
     assert error.log_tail.startswith("no luck: -")
@@ -144,8 +143,7 @@ def test_a_mended_repository_survives(tmp_path: Path) -> None:
     assert document("replay", "--grant", str(error.bundle), code=8)["replayed"]["death"] is None
     entry.write_text(entry.read_text().replace("lambda: 1 / 0", "lambda: os._exit(10)"))
     found = document("replay", "--grant", str(error.bundle), code=7)
-    assert found["verdict"] == "different"
-    assert found["replayed"]["death"]["exit_code"] == 10
+    assert (found["verdict"], found["replayed"]["death"]["exit_code"]) == ("different", 10)
 
 
 def test_a_death_in_make_env_is_repeated_too(tmp_path: Path) -> None:

@@ -47,11 +47,9 @@ def test_options_and_tasks_travel() -> None:
             assert list(again["suite"]) == [0, 1]
             assert again is not suites
         one = pickle.loads(pickle.dumps(suites["suite"][1]))
-        assert one.num_envs == 3
-        assert inside.repository(one).timeouts.step_s == 12.5
+        assert (one.num_envs, inside.repository(one).timeouts.step_s) == (3, 12.5)
         assert inside.repository(one).policy.restart == "on_reset"
-        assert inside.repository(one).policy.lane == "frames"
-        assert inside.manifest(one).task == 1
+        assert (inside.repository(one).policy.lane, inside.manifest(one).task) == ("frames", 1)
         one.close()
 
 

@@ -89,8 +89,7 @@ def test_the_dead_come_back_and_the_others_go_on(env: Any, how: int) -> None:
         assert np.array_equal(mine[:2], other[:2])
     observation, rewards, terminated, truncated, info = got
     assert np.array_equal(observation[DEAD], fresh(1))
-    assert rewards[DEAD].tolist() == [0, 0]
-    assert truncated.tolist() == [False, False, True, True]
+    assert (rewards[DEAD].tolist(), truncated.tolist()) == ([0, 0], [False, False, True, True])
     assert not terminated.any()
     assert restarted(info)
     assert info["at"].tolist() == [2, 2, 0, 0]
@@ -264,8 +263,7 @@ def test_a_call_is_not_repeated(env: Any) -> None:
     for _ in range(2):
         with pytest.raises(errors.WorkerDiedError) as caught:
             env.call("last_words")
-        assert caught.value.exit_code == 5
-        assert caught.value.request == "call"
+        assert (caught.value.exit_code, caught.value.request) == (5, "call")
         assert inside.state(env) is State.READY
     observation, _, _, truncated, info = env.step(ALL_LIVE)
     assert truncated.all()

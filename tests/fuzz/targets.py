@@ -402,8 +402,7 @@ def spoiled_message(dice: Dice, message: m.Message) -> m.Message:
     frames = attempt(lambda: m.pack(type(message)(*fields)))
     if is_error(frames):
         raise NotSentError
-    found: m.Message = m.unpack(frames)
-    return found
+    return m.unpack(frames)
 
 
 def server(dice: Dice) -> None:

@@ -18,8 +18,7 @@ def test_an_evaluation_is_the_same(olah: OlahServer, tmp_path: Path) -> None:
     found = run("evaluation_program.py", olah, tmp_path, f"robots/evaluated@{commit}", commands)
     here = found["here"]
     assert found["executed by LeRobot"]  # the control: that code was in that process
-    assert len(here["metrics"]) == 1
-    assert len(here["videos"]) == 4
+    assert (len(here["metrics"]), len(here["videos"])) == (1, 4)
     assert found["installed"] == here
     assert found["own"] == here
     if found["asks configs"]:

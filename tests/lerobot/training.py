@@ -24,12 +24,9 @@ def test_a_training_is_the_same(olah: OlahServer, tmp_path: Path) -> None:
         pytest.skip("this LeRobot lets no configuration make its environments")
     here = found["here"]
     assert found["executed by LeRobot"]  # the control: that code was in that process
-    assert len(here["evaluations"]) == 2
-    assert len(here["weights"]) == 2
-    assert len(here["videos"]) == 8
+    assert (len(here["evaluations"]), len(here["weights"]), len(here["videos"])) == (2, 2, 8)
     assert found["sandboxed"] == here
     assert found["saved"].endswith(f"robots/trained@{commit}")  # the branch, pinned
     # resumed from the last checkpoint, by what was saved
-    assert len(found["resumed"]["evaluations"]) == 1
-    assert len(found["resumed"]["weights"]) == 3
+    assert (len(found["resumed"]["evaluations"]), len(found["resumed"]["weights"])) == (1, 3)
     assert not found["executed here"]

@@ -95,8 +95,7 @@ class Listening:
 
     def sessions(self) -> list[dict[str, Any]]:
         """Those that it has; the asker's is not among them."""
-        found: list[dict[str, Any]] = self.status()["sessions"]
-        return found
+        return self.status()["sessions"]
 
     def status(self) -> dict[str, Any]:
         asked = argparse.Namespace(state_dir=self.state, endpoint=None, json=True)
@@ -104,8 +103,7 @@ class Listening:
             patch.setattr(*inside.STATUS_WAIT_MS, 60_000)  # an operator waits less
             patch.setattr("sys.stdout", said := io.StringIO())
             assert status.run(asked) == 0
-        found: dict[str, Any] = json.loads(said.getvalue())
-        return found
+        return json.loads(said.getvalue())
 
     def as_client(self) -> tuple[str, ...]:
         """Options by which ``envhub-worker`` asks this server with its client's key."""

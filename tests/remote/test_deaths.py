@@ -30,8 +30,7 @@ def test_what_dies_over_there_comes_back(server: Listening) -> None:
         sandbox=server.sandbox(),
     ) as env:
         observation, _, _, truncated, info = env.step([LIVE, EXIT])
-        assert observation[:, 1].tolist() == [1, 0]
-        assert truncated.tolist() == [False, True]
+        assert (observation[:, 1].tolist(), truncated.tolist()) == ([1, 0], [False, True])
         assert np.array_equal(info["worker_restarted"], truncated)
         env.step([LIVE, LIVE])
         assert env.step([LIVE, LIVE])[0][:, 1].tolist() == [3, 1]

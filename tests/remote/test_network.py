@@ -174,8 +174,7 @@ def test_a_killed_clients_jails_end(impatient: Listening, repository: Path) -> N
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
-    assert client.stdout.readline() == b"ready\n"
-    assert impatient.jails() == 1
+    assert (client.stdout.readline(), impatient.jails()) == (b"ready\n", 1)
     os.kill(client.pid, signal.SIGKILL)
     client.communicate()
     assert eventually(lambda: impatient.jails() == 0)

@@ -49,8 +49,7 @@ def document(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
     """The document of ``--json``, which is all that is on stdout."""
     done = envhub(*arguments, "--json")
     assert done.returncode == code, done.stderr
-    read: dict[str, Any] = json.loads(done.stdout, parse_constant=pytest.fail)
-    return read
+    return json.loads(done.stdout, parse_constant=pytest.fail)
 
 
 def below(pid: int) -> list[psutil.Process]:

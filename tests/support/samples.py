@@ -45,8 +45,7 @@ def make_env_of(folder: Path) -> Callable[..., Any]:
     with pytest.MonkeyPatch.context() as patch:  # a repository in which bytecode lies is refused
         patch.setattr(sys, "dont_write_bytecode", True)
         entry = importlib.import_module(f"{package}.env")
-    make_env: Callable[..., Any] = entry.make_env
-    return make_env
+    return entry.make_env
 
 
 def reference(name: str, n_envs: int = 1, **env_kwargs: Any) -> gym.vector.VectorEnv[Any, Any, Any]:

@@ -410,8 +410,7 @@ def test_a_jail_that_lists_everything_serves_what_is_honest(arena: Arena, home: 
     with make_env(trap, n_envs=2, **arena.place({})) as suites:
         env = suites.env
         env.reset(seed=0)
-        assert env.hub_config == {"robot": "so100"}
-        assert getattr(env, ENSURE)() == "ensured"
+        assert (env.hub_config, getattr(env, ENSURE)()) == ({"robot": "so100"}, "ensured")
         for title, through in attempts(env, canary).items():
             arena.judge(title, "succeeds", through, "")
         assert np.asarray(env).item() is env

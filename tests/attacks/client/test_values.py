@@ -246,8 +246,7 @@ def described(space: Any = None) -> dict[str, Any]:
 
 
 def space_of(value: Any) -> dict[str, Any]:
-    found: dict[str, Any] = value["envs"][0]["single_action_space"]
-    return found
+    return value["envs"][0]["single_action_space"]
 
 
 def read(value: object, elements: int = ELEMENTS) -> Manifest:

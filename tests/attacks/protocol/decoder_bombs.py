@@ -38,8 +38,7 @@ def map32(count: int, content: bytes) -> bytes:
 
 
 def extension(code: int, payload: bytes) -> bytes:
-    content: bytes = msgpack.packb(ext(code, payload))
-    return content
+    return msgpack.packb(ext(code, payload))
 
 
 def many(token: bytes, count: int) -> Frames:

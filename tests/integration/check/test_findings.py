@@ -279,8 +279,7 @@ def test_missing_papers_are_told(tmp_path: Path) -> None:
     """Notes, which fail nothing unless one asks for it; the head of a card may name a licence."""
     report = judged(write_repository(tmp_path / "bare", _HONEST))
     assert {one.id for one in report.findings} == {"licence", "card"}
-    assert report.failures(Severity.ERROR) == []
-    assert len(report.failures(Severity.NOTE)) == 2
+    assert (report.failures(Severity.ERROR), len(report.failures(Severity.NOTE))) == ([], 2)
     assert [one.id for one in report.failures(Severity.NOTE, ["card"])] == ["licence"]
     card = "---\nlicense: mit\n---\n# Walk"
     report = judged(write_repository(tmp_path / "card", _HONEST, README__md=card))

@@ -73,8 +73,7 @@ def test_wheels_that_were_built_here_are_listed_and_removed(stored: list[str]) -
     for words in (["one-wheel"], ["--unused-for", "30"]):
         done = RUNNER.invoke(app, ["cache", "remove", *words])
         assert "Removed 0 snapshots, 0 environments, 1 wheel, " in done.stderr
-    assert list((cache_root() / "wheels").iterdir()) == []
-    assert len(stored_snapshots()) == 3
+    assert (list((cache_root() / "wheels").iterdir()), len(stored_snapshots())) == ([], 3)
 
 
 def test_hub_repositories_are_named_as_they_are_written(
@@ -280,5 +279,4 @@ def test_an_engine_that_is_down_is_said_to_be_so(tmp_path: Path) -> None:
     assert "docker could not be asked, so its containers are not known" in done.stderr
     assert not folder.exists()
     again = gc(tmp_path, "--json", check=False)
-    assert again.returncode == 9
-    assert set(json.loads(again.stdout)["unasked"]) == {"docker"}
+    assert (again.returncode, set(json.loads(again.stdout)["unasked"])) == (9, {"docker"})

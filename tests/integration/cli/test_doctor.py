@@ -104,8 +104,7 @@ def test_a_cache_that_cannot_be_used_hides_no_layer(monkeypatch: pytest.MonkeyPa
     done = RUNNER.invoke(app, ["doctor"])
     assert "strict: available" in done.stdout
     assert "The cache: /dev/null/none cannot be written: set ENVHUB_CACHE to another" in done.stdout
-    assert done.exit_code == 3
-    assert os.environ["ENVHUB_CACHE"] == "/dev/null/none"
+    assert (done.exit_code, os.environ["ENVHUB_CACHE"]) == (3, "/dev/null/none")
 
 
 def test_a_user_without_a_home_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -73,8 +73,7 @@ def test_inspect_steps_nothing(tmp_path: Path) -> None:
     folder = one_env(tmp_path / "one", "raise RuntimeError('stepped')")
     found = document("inspect", folder, "--n-envs", "3")
     [env] = found["envs"]
-    assert env["num_envs"] == 3
-    assert env["single_action_space"] == "Discrete(2)"
+    assert (env["num_envs"], env["single_action_space"]) == (3, "Discrete(2)")
     assert env["action_space"] == "MultiDiscrete([2 2 2])"
     text = envhub("inspect", folder).stdout
     assert "Discrete(2)" in text
@@ -193,8 +192,7 @@ def test_output_and_life_of_a_jail_go_where_they_are_wanted(tmp_path: Path) -> N
     dies = ("--env-kwargs", "moment=step", "--env-kwargs", "fault=exit")
     kept = ("--worker-output", tmp_path / "worker.log", "--verbose", "--json")
     done = envhub("run", sample("faulty"), *dies, *kept)
-    assert done.returncode == 5
-    assert (tmp_path / "worker.log").read_text() == "about to exit\n"
+    assert (done.returncode, (tmp_path / "worker.log").read_text()) == (5, "about to exit\n")
     assert "opened" in done.stderr
     assert "closes" in done.stderr
     assert (Path(json.loads(done.stdout)["error"]["bundle"]) / "bundle.json").exists()

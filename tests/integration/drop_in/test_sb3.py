@@ -197,14 +197,12 @@ def test_options_go_to_whom_they_are_for(counters: SandboxVecEnv) -> None:
 
 def test_attributes_and_methods(counters: SandboxVecEnv) -> None:
     counters.reset()
-    assert counters.get_attr("index") == [0, 1, 2]
-    assert counters.get_attr("index", [2, 0]) == [2, 0]
+    assert (counters.get_attr("index"), counters.get_attr("index", [2, 0])) == ([0, 1, 2], [2, 0])
     assert counters.env_method("add", 1, b=2) == [3, 103, 203]
     assert counters.env_method("add", 1, indices=[0, -1, 0]) == [11, 211, 11]
     counters.set_attr("gain", 2.0)
     counters.set_attr("gain", 3.0, indices=1)
-    assert counters.get_attr("gain") == [2.0, 3.0, 2.0]
-    assert counters.envs[1].gain == 3.0
+    assert (counters.get_attr("gain"), counters.envs[1].gain) == ([2.0, 3.0, 2.0], 3.0)
     assert not counters.has_attr("nothing_of_the_kind")
     assert counters.has_attr("fail"), "a method is looked at, and not called"
     assert [add(1) for add in counters.get_attr("add")] == [11, 111, 211]

@@ -48,8 +48,7 @@ def test_a_full_server_is_followed_by_the_next(
     small = serve("small", "--max-jails", "1")
     sandboxes = [small.sandbox(), servers[0].sandbox()]
     with started(rows, n_envs=4, sandbox=sandboxes, num_workers=4) as env:
-        assert sorted(Counter(places(env)).values()) == [1, 3]
-        assert small.jails() == 1
+        assert (sorted(Counter(places(env)).values()), small.jails()) == ([1, 3], 1)
         env.step(np.zeros(4, int))
 
 

@@ -99,8 +99,7 @@ def test_damaged_hub_cache_is_repaired_from_the_hub(
     assert (first.root / "env.py").read_bytes() == GOOD
     remove_tree(snapshot_store)
     before = len(requests_for_files(stub_hub))
-    assert (get().root / "env.py").read_bytes() == GOOD
-    assert blob.read_bytes() == GOOD
+    assert ((get().root / "env.py").read_bytes(), blob.read_bytes()) == (GOOD, GOOD)
     again = requests_for_files(stub_hub)[before:]
     assert {request.rpartition("/")[2] for request in again} == {"env.py"}
     assert first.commit == get().commit

@@ -85,8 +85,7 @@ def test_branch_tag_and_short_commit_name_the_full_commit(olah: OlahServer, get:
         first[:8]: first,
         second: second,
     }
-    assert contents(found["v1"]) == {"env.py": b"1"}
-    assert contents(found["dev"]) == {"env.py": b"3"}
+    assert (contents(found["v1"]), contents(found["dev"])) == ({"env.py": b"1"}, {"env.py": b"3"})
 
 
 @pytest.mark.parametrize("repo_type", ["model", "space", "dataset"])

@@ -121,6 +121,5 @@ def test_an_interrupted_import_leaves_no_server_behind(
     done = python("-c", f"NAME, KIND = {name!r}, {kind}{_IMPORTS}", TMPDIR=str(runtime))
     *servers, left, answer = done.stdout.splitlines()
     assert set(servers) == {"servers: 1"}
-    assert (left, answer) == ("left: 0", "[[5.0, 0.0], [5.0, 0.0]]")
-    assert done.stderr == ""
+    assert ((left, answer), done.stderr) == (("left: 0", "[[5.0, 0.0], [5.0, 0.0]]"), "")
     assert list(runtime.iterdir()) == []

@@ -63,8 +63,7 @@ def test_a_bundle_is_its_owners(tmp_path: Path, umask: str) -> None:
     assert "WorkerDiedError" in done.stderr
     bundle = next((cache / "crashes").iterdir())
     assert {path.name for path in bundle.iterdir()} >= {"bundle.json", "README.txt"}
-    assert stat.S_IMODE(bundle.stat().st_mode) == 0o700
-    assert open_to_others(cache) == []
+    assert (stat.S_IMODE(bundle.stat().st_mode), open_to_others(cache)) == (0o700, [])
 
 
 @pytest.mark.parametrize("umask", UMASKS)

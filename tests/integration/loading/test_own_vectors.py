@@ -175,8 +175,7 @@ class TestSpacesThatAreMissing:
             env = suites.env
             assert env.single_observation_space["agent_pos"].shape == (4,)
             assert env.observation_space["agent_pos"].shape == (3, 4)
-            assert env.single_action_space.shape == (2,)
-            assert env.action_space.shape == (3, 2)
+            assert (env.single_action_space.shape, env.action_space.shape) == ((2,), (3, 2))
             observations, _ = env.reset(seed=0)
             assert observations["agent_pos"].shape == (3, 4)
             env.step(env.action_space.sample())

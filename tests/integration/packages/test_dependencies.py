@@ -67,8 +67,7 @@ def test_once_made_it_needs_no_index(packages: Index, tmp_path: Path) -> None:
     packages.broken, asked = 503, len(packages.asked)
     try:
         with make_env(folder) as suites, make_env(older) as others:
-            assert suites.env.call("version") == ("2.0",)
-            assert others.env.call("version") == ("1.0",)
+            assert (suites.env.call("version"), others.env.call("version")) == (("2.0",), ("1.0",))
             assert suites.env.call("where") != others.env.call("where")
     finally:
         packages.broken = 0

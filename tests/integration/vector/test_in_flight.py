@@ -90,8 +90,7 @@ def test_a_death_is_survived(gates: Gates, of_itself: bool) -> None:
     else:
         kill(env, 1)
     received = env.recv(1)
-    assert ids(received) == [1]
-    assert received.truncations.tolist() == [True]
+    assert (ids(received), received.truncations.tolist()) == ([1], [True])
     assert received.rewards.tolist() == [0.0]
     assert received.infos["worker_restarted"].tolist() == [True]
     for steps in (20, 21):  # the first is the autoreset
@@ -136,8 +135,7 @@ def test_a_step_may_take_too_long(gates: Gates) -> None:
         send(env, 0, 1)
         with pytest.raises(WorkerTimeoutError, match=r"step has not finished after 2\.0 s") as late:
             env.recv(2)
-        assert late.value.env_ids == (1,)
-        assert ids(env.recv(2)) == [0]
+        assert (late.value.env_ids, ids(env.recv(2))) == ((1,), [0])
         send(env, 0, ids=[0])
         assert ids(env.recv(2)) == [0]
         with pytest.raises(WorkerTimeoutError, match="late") as again:

@@ -42,22 +42,18 @@ def test_who_answers_first_is_found_first(gates: Gates) -> None:
     send(other, 2)
     assert answered(one, other, timeout_s=0) == []
     gates.open(2)
-    assert answered(one, other) == [1]
-    assert other.step_wait()[1].tolist() == [2.0]
+    assert (answered(one, other), other.step_wait()[1].tolist()) == ([1], [2.0])
     send(other, 3)
     gates.open(1)
-    assert answered(one, other) == [0]
-    assert one.step_wait()[1].tolist() == [1.0]
+    assert (answered(one, other), one.step_wait()[1].tolist()) == ([0], [1.0])
     gates.open(3)
-    assert answered(other) == [0]
-    assert other.step_wait()[1].tolist() == [3.0]
+    assert (answered(other), other.step_wait()[1].tolist()) == ([0], [3.0])
     several = gates.env(2, use_async_envs=True, num_workers=2)
     send(several, 4, 5)
     gates.open(5)
     assert answered(several, timeout_s=0.2) == [], "it is one step, over two processes"
     gates.open(4)
-    assert answered(several) == [0]
-    assert several.step_wait()[1].tolist() == [4.0, 5.0]
+    assert (answered(several), several.step_wait()[1].tolist()) == ([0], [4.0, 5.0])
 
 
 def test_large_infos_belong_to_the_answer(gates: Gates) -> None:
@@ -65,8 +61,7 @@ def test_large_infos_belong_to_the_answer(gates: Gates) -> None:
     env = gates.env()
     for _ in range(3):
         send(env, 0, large=1)
-        assert answered(env) == [0]
-        assert answered(env) == [0]
+        assert (answered(env), answered(env)) == ([0], [0])
         assert env.step_wait()[4]["said"].tolist() == ["x" * 200_000]
         assert env.step(np.array([[0, 1]]))[4]["said"].tolist() == ["x" * 200_000]
         assert env.step(np.array([[0, 0]]))[4]["said"].tolist() == ["x"]
@@ -83,11 +78,9 @@ def test_a_reset_is_answered_as_well(gates: Gates) -> None:
     for policy in ({}, {"restart": "transparent"}):
         env = gates.env(policy=policy)
         env.reset_async(seed=1)
-        assert answered(env) == [0]
-        assert env.reset_wait()[0].tolist() == [[0, 1]]
+        assert (answered(env), env.reset_wait()[0].tolist()) == ([0], [[0, 1]])
         env.call_async("action_space")
-        assert answered(env) == [0]
-        assert env.call_wait()[0].nvec.tolist() == [1000, 4]
+        assert (answered(env), env.call_wait()[0].nvec.tolist()) == ([0], [1000, 4])
 
 
 @pytest.mark.parametrize("restart", ["never", "transparent"])

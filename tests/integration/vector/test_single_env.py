@@ -143,8 +143,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def here(folder: Path) -> gym.Env[Any, Any]:
-    env: gym.Env[Any, Any] = make_env_of(folder)().envs[0]
-    return env
+    return make_env_of(folder)().envs[0]
 
 
 @pytest.fixture(params=["auto", "frames"])

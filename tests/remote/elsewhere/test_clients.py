@@ -122,8 +122,7 @@ def test_ctrl_c_interrupts_a_step(system: str, server: Listening, tmp_path: Path
         time.sleep(0.5)  # so that it waits; sooner is an interrupt, too
         process.send_signal(signal.SIGINT)
         said = process.stdout.read()
-    assert said == "interrupted True\n[1.0]\n"
-    assert process.returncode == 0
+    assert (said, process.returncode) == ("interrupted True\n[1.0]\n", 0)
 
 
 def test_ctrl_c_ends_a_command(system: str, server: Listening, tmp_path: Path) -> None:

@@ -58,8 +58,7 @@ def test_who_is_not_let_in_is_told_why(server: Listening) -> None:
     assert "does not know our key" in err
     other = ["doctor", f"{server.endpoint} {key_text(keys.generate().public)}"]
     done = RUNNER.invoke(app, other, env={"ENVHUB_CLIENT_KEY": server.client_key})
-    assert done.exit_code == 6
-    assert RUNNER.invoke(app, ["doctor", "http://example"]).exit_code == 2
+    assert (done.exit_code, RUNNER.invoke(app, ["doctor", "http://example"]).exit_code) == (6, 2)
     assert RUNNER.invoke(app, ["doctor", server.endpoint, "--profile", "lax"]).exit_code == 2
 
 

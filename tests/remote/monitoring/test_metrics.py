@@ -97,8 +97,7 @@ def test_readiness_is_red_in_a_drain(tmp_path: Path, repository: Path) -> None:
         one.server.process.terminate()
         assert eventually(lambda: one.get("/readyz")[0] == 503)
         assert "drains" in one.get("/readyz")[1]
-        assert one.get("/healthz")[0] == 200
-        assert one.values()["envhub_server_draining",] == 1
+        assert (one.get("/healthz")[0], one.values()["envhub_server_draining",]) == (200, 1)
         assert one.server.status()["server"]["draining_s"] > 0
 
 
@@ -108,15 +107,13 @@ def test_a_server_that_is_stuck_is_not_healthy(one: Watched) -> None:
     page = MetricsPage(True, lambda _: ("text/plain", b"figures"), lambda: now[0])
     assert page.answer("/healthz")[0] == page.answer("/metrics")[0] == 503
     page.publish({"draining_s": None})
-    assert page.answer("/metrics")[2] == b"figures"
-    assert page.answer("/readyz")[0] == 200
+    assert (page.answer("/metrics")[2], page.answer("/readyz")[0]) == (b"figures", 200)
     now[0] = STALE_S + 1
     for path in ("/metrics", "/healthz", "/readyz"):
         assert page.answer(path)[0] == 503
     unusable = MetricsPage(False, lambda _: ("text/plain", b""), lambda: now[0])
     unusable.publish({"draining_s": None})
-    assert unusable.answer("/readyz")[0] == 503
-    assert unusable.answer("/healthz")[0] == 200
+    assert (unusable.answer("/readyz")[0], unusable.answer("/healthz")[0]) == (503, 200)
 
 
 # --- where it listens --------------------------------------------------------------------------
@@ -158,8 +155,7 @@ def good(one: Watched, repository: Path) -> Iterator[Any]:
     """A client's environment and a reader of figures, which both must go on."""
     with started(repository, sandbox=one.server.sandbox()) as env:
         yield env
-        assert env.step(np.array([0]))[0].tolist() == [[1.0]]
-        assert one.get("/healthz")[0] == 200
+        assert (env.step(np.array([0]))[0].tolist(), one.get("/healthz")[0]) == ([[1.0]], 200)
 
 
 def test_slow_readers_and_writers_are_shown_the_door(one: Watched, good: Any) -> None:
@@ -301,8 +297,7 @@ def test_a_page_that_fails_is_an_answer() -> None:
     port = HttpPort("127.0.0.1", 0, answer, said.append)
     try:
         number = int(port.address.rpartition(":")[2])
-        assert get(number, "/wrong")[0] == 500
-        assert get(number, "/right") == (200, "right")
+        assert (get(number, "/wrong")[0], get(number, "/right")) == (500, (200, "right"))
     finally:
         port.close()
     assert len(said) == 1

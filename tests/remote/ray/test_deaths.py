@@ -148,8 +148,7 @@ def test_a_local_ray_is_started_and_said(repository: Path, tmp_path: Path) -> No
         env={**os.environ, "RAY_TMPDIR": "/tmp/ray-none", "RAY_ADDRESS": ""},
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["1"]
-    assert done.stderr.count("a local Ray with") == 1
+    assert (done.stdout.split(), done.stderr.count("a local Ray with")) == (["1"], 1)
     assert eventually(lambda: not servers())
 
 

@@ -85,5 +85,4 @@ def send(env: Any, *gates: int, ids: Any = None, what: int = 0) -> None:
 
 
 def ids(received: Any) -> list[int]:
-    found: list[int] = received.env_ids.tolist()
-    return found
+    return received.env_ids.tolist()
