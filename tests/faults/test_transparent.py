@@ -23,26 +23,24 @@ from tests.support.processes import eventually, halted
 from tests.support.repositories import write_repository
 from tests.support.samples import reference, sample
 
+POLICY = {"restart": "transparent", "restart_backoff_s": 0, "crash_history": 0}
 LAST_DIES = [LIVE, LIVE, LIVE, EXIT]
-DEAD = slice(2, 4)
+DEAD, ALL = slice(2, 4), slice(4)
 
 pytestmark = pytest.mark.usefixtures("neighbour")
 
 
 def made(
-    lane: str = "auto", shards: int = 2, env_kwargs: dict[str, Any] | None = None, **more: Any
+    lane: str = "auto",
+    shards: int = 2,
+    env_kwargs: dict[str, Any] | None = None,
+    folder: Path | None = None,
+    **more: Any,
 ) -> Any:
     """Four sub-environments in two processes, of which the second holds the last two."""
-    policy = {"restart": "transparent", "restart_backoff_s": 0, "crash_history": 0}
-    return make_env(
-        sample("mortal"),
-        n_envs=4,
-        use_async_envs=True,
-        num_workers=shards,
-        policy={**policy | more.pop("policy", {}), "lane": lane},
-        env_kwargs=env_kwargs or {},
-        **more,
-    )
+    policy = POLICY | {"lane": lane} | more.pop("policy", {})
+    options = {"num_workers": shards, "policy": policy, "env_kwargs": env_kwargs or {}, **more}
+    return make_env(folder or sample("mortal"), n_envs=4, use_async_envs=True, **options)
 
 
 def fresh(restart: int, rows: slice = DEAD) -> Any:
@@ -53,10 +51,26 @@ def fresh(restart: int, rows: slice = DEAD) -> Any:
 
 
 def restarted(info: dict[str, Any], rows: slice = DEAD) -> bool:
-    expected = np.zeros(4, bool)
-    expected[rows] = True
+    expected = np.isin(range(4), range(4)[rows])
     both = info["worker_restarted"], info["_worker_restarted"]
     return all(np.array_equal(one, expected) for one in both)
+
+
+def came_back(result: Any, counts: list[int] | None = None, rows: slice = DEAD) -> None:
+    """Of a step: these rows, and no other, are truncated and marked; what has been counted."""
+    observation, _, _, truncated, info = result
+    assert truncated.tolist() == np.isin(range(4), range(4)[rows]).tolist()
+    assert restarted(info, rows)
+    assert counts is None or observation[:, 1].tolist() == counts
+
+
+def goes_on(env: Any, counts: tuple[int, ...] = (1, 1, 1, 1)) -> None:
+    assert env.step(ALL_LIVE)[0][:, 1].tolist() == list(counts)
+
+
+def dies(env: Any, number: int = 1) -> None:
+    """One of its processes, from outside."""
+    os.kill(inside.pids(env)[number], signal.SIGKILL)
 
 
 @contextmanager
@@ -87,12 +101,10 @@ def test_the_dead_come_back_and_the_others_go_on(env: Any, how: int) -> None:
     got, expected = env.step([LIVE, LIVE, how, LIVE]), beside.step(ALL_LIVE)
     for mine, other in zip(got[:4], expected[:4], strict=True):
         assert np.array_equal(mine[:2], other[:2])
-    observation, rewards, terminated, truncated, info = got
-    assert np.array_equal(observation[DEAD], fresh(1))
-    assert (rewards[DEAD].tolist(), truncated.tolist()) == ([0, 0], [False, False, True, True])
-    assert not terminated.any()
-    assert restarted(info)
-    assert info["at"].tolist() == [2, 2, 0, 0]
+    came_back(got)
+    assert np.array_equal(got[0][DEAD], fresh(1))
+    assert (got[1][DEAD].tolist(), got[2].any()) == ([0, 0], False)
+    assert got[4]["at"].tolist() == [2, 2, 0, 0]
     assert inside.state(env) is State.READY
     assert env.sandbox.stats()["deaths"] == env.sandbox.stats()["restarts"] == 1
 
@@ -139,11 +151,10 @@ def test_the_only_process_comes_back_whole(lane: str) -> None:
     with begun(lane, shards=1) as env:
         jail = inside.jail(env).number
         for restart in (1, 2):
-            observation, rewards, _, truncated, info = env.step(LAST_DIES)
-            assert np.array_equal(observation, fresh(restart, slice(4)))
-            assert truncated.all()
-            assert not rewards.any()
-            assert restarted(info, slice(4))
+            got = env.step(LAST_DIES)
+            came_back(got, rows=ALL)
+            assert np.array_equal(got[0], fresh(restart, ALL))
+            assert not got[1].any()
             assert not env.step(ALL_LIVE)[3].any()  # the reset after a truncation
         assert inside.jail(env).number == jail
 
@@ -175,16 +186,13 @@ def test_a_reset_is_done_again_in_the_fresh_process(lane: str) -> None:
         expected, _ = oracle().reset(seed=SEED)
         assert np.array_equal(observation, expected)
         assert restarted(info, slice(0, 2)) or restarted(info, DEAD)
-        assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
+        goes_on(env)
 
 
 @lanes
 @pytest.mark.parametrize("dies_in", ["step", "reset"])
 def test_infos_that_differ_in_kind_survive_a_death(tmp_path: Path, lane: str, dies_in: str) -> None:
-    folder = write_repository(tmp_path / "mixed", _MIXED)
-    policy = {"restart": "transparent", "restart_backoff_s": 0, "crash_history": 0}
-    options: dict[str, Any] = {"num_workers": 2, "policy": {**policy, "lane": lane}}
-    with make_env(str(folder), n_envs=4, use_async_envs=True, **options) as suites:
+    with made(lane, folder=write_repository(tmp_path / "mixed", _MIXED)) as suites:
         env = suites.env
         _, expected = env.reset()
         kept = [one.np_random for one in env.envs]  # which the client asks for after each request
@@ -240,7 +248,7 @@ def test_a_masked_reset_brings_back_whom_it_does_not_name(env: Any) -> None:
     assert observation[:, 1].tolist()[2:] == [0, 0]
     assert np.array_equal(observation[2], reference("mortal").reset(seed=99)[0][0])
     assert np.array_equal(observation[3], fresh(1)[1])
-    assert env.step(ALL_LIVE)[0][:, 1].tolist() == [2, 2, 1, 1]
+    goes_on(env, (2, 2, 1, 1))
 
 
 def test_who_dies_again_in_coming_back_is_dead() -> None:
@@ -254,7 +262,7 @@ def test_who_dies_again_in_coming_back_is_dead() -> None:
         with pytest.raises(errors.WorkerDiedError, match="cannot step"):
             env.step(ALL_LIVE)
         env.reset(seed=SEED)
-        assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
+        goes_on(env)
 
 
 def test_a_call_is_not_repeated(env: Any) -> None:
@@ -263,12 +271,10 @@ def test_a_call_is_not_repeated(env: Any) -> None:
     for _ in range(2):
         with pytest.raises(errors.WorkerDiedError) as caught:
             env.call("last_words")
-        assert (caught.value.exit_code, caught.value.request) == (5, "call")
+        assert caught.value.exit_code == 5
+        assert caught.value.request == "call"
         assert inside.state(env) is State.READY
-    observation, _, _, truncated, info = env.step(ALL_LIVE)
-    assert truncated.all()
-    assert restarted(info, slice(4))
-    assert observation[:, 1].tolist() == [0, 0, 0, 0]
+    came_back(env.step(ALL_LIVE), [0, 0, 0, 0], ALL)
     assert env.call("hello") == ("hello",) * 4
 
 
@@ -279,12 +285,10 @@ def test_attributes_that_were_set_are_set_again(env: Any) -> None:
     env.set_attr("weight", [5, 6, 7, 8])
     with pytest.raises(errors.RemoteEnvError):
         env.set_attr("fixed", 3)
-    *_, truncated, info = env.step(LAST_DIES)
-    assert truncated.tolist() == [False, False, True, True]
-    assert restarted(info)
+    came_back(env.step(LAST_DIES))
     assert env.get_attr("weight") == (5, 6, 7, 8)
     assert env.get_attr("colour") == ("red", "green", "blue", "white")
-    os.kill(inside.pids(env)[1], signal.SIGKILL)
+    dies(env)
     env.reset(seed=SEED)
     assert env.get_attr("weight") == (5, 6, 7, 8)
 
@@ -296,8 +300,7 @@ def test_what_was_set_in_one_sub_environment_is_set_again(env: Any) -> None:
     env.envs[2].set_wrapper_attr("colour", "red")
     env.envs[3].colour = "blue"
     env.call("__setattr__", "colour", "green")
-    *_, truncated, _ = env.step(LAST_DIES)
-    assert truncated.tolist() == [False, False, True, True]
+    came_back(env.step(LAST_DIES))
     assert env.get_attr("weight") == (5, 5, 5, 6)
     assert env.get_attr("colour") == ("green",) * 4
 
@@ -318,8 +321,7 @@ def test_an_attribute_that_cannot_be_set_again_is_left_out(
     with begun() as env:
         env.set_attr("drawn_so_far", 0.5)
         with caplog.at_level("WARNING", "envhub_sandbox.worker"):
-            *_, truncated, _ = env.step(LAST_DIES)
-        assert truncated.tolist() == [False, False, True, True]
+            came_back(env.step(LAST_DIES))
         assert "'drawn_so_far' could not be set again" in caplog.text
 
 
@@ -327,10 +329,9 @@ def test_a_death_that_is_mended_is_logged(env: Any, caplog: pytest.LogCaptureFix
     """How it died and whose rows start again: the caller sees it in the infos only."""
     with caplog.at_level("INFO", "envhub_sandbox.worker"):
         env.step(LAST_DIES)
-    told = [one for one in caplog.messages if "start again" in one]
-    assert len(told) == 1
-    assert "the worker process died during step: it exited (exit code" in told[0]
-    assert "sub-environments [2, 3]" in told[0]
+    [told] = [one for one in caplog.messages if "start again" in one]
+    assert "the worker process died during step: it exited (exit code" in told
+    assert "sub-environments [2, 3]" in told
 
 
 def test_a_fresh_jail_has_no_attributes_of_the_last() -> None:
@@ -338,31 +339,27 @@ def test_a_fresh_jail_has_no_attributes_of_the_last() -> None:
         env.set_attr("weight", 7)
         with pytest.raises(errors.WorkerTimeoutError):
             env.step([SPIN, LIVE, LIVE, LIVE])
-        env.reset(seed=SEED)
-        with pytest.raises(errors.RemoteEnvError):
-            env.get_attr("weight")
-        os.kill(inside.pids(env)[1], signal.SIGKILL)
-        env.reset(seed=SEED)
-        with pytest.raises(errors.RemoteEnvError):
-            env.get_attr("weight")
+        for also_dies in (True, False):
+            env.reset(seed=SEED)
+            with pytest.raises(errors.RemoteEnvError):
+                env.get_attr("weight")
+            if also_dies:
+                dies(env)
 
 
 @both
 def test_a_death_between_requests_is_met_by_the_next(env: Any) -> None:
     """Killed from outside while nothing is asked: a call says so, a step brings it back."""
     victim = inside.pids(env)[1]
-    os.kill(victim, signal.SIGKILL)
+    dies(env)
     assert eventually(lambda: not psutil.pid_exists(victim))
     with pytest.raises(errors.WorkerDiedError, match="SIGKILL"):
         env.get_attr("steps")
-    observation, _, _, truncated, info = env.step(ALL_LIVE)
-    assert truncated.tolist() == [False, False, True, True]
-    assert observation[:, 1].tolist() == [1, 1, 0, 0]
-    assert restarted(info)
+    came_back(env.step(ALL_LIVE), [1, 1, 0, 0])
 
 
 def test_a_reset_brings_back_who_died_between_requests(env: Any) -> None:
-    os.kill(inside.pids(env)[1], signal.SIGKILL)
+    dies(env)
     observation, info = env.reset(seed=SEED)
     assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
     assert restarted(info)
@@ -370,15 +367,12 @@ def test_a_reset_brings_back_who_died_between_requests(env: Any) -> None:
 
 @both
 def test_the_end_of_the_jail_takes_all_rows(env: Any) -> None:
-    jail = inside.jail(env).number
-    runners = inside.pids(env)
-    init = psutil.Process(runners[0]).parent()
-    init.kill()
+    jail, runners = inside.jail(env).number, inside.pids(env)
+    psutil.Process(runners[0]).parent().kill()
     assert eventually(lambda: not any(map(psutil.pid_exists, runners)))
-    observation, _, _, truncated, info = env.step(ALL_LIVE)
-    assert truncated.all()
-    assert restarted(info, slice(4))
-    assert np.array_equal(observation, fresh(1, slice(4)))
+    got = env.step(ALL_LIVE)
+    came_back(got, rows=ALL)
+    assert np.array_equal(got[0], fresh(1, ALL))
     assert inside.jail(env).number != jail
 
 
@@ -397,10 +391,7 @@ def test_memory_of_all_takes_all_rows(lane: str) -> None:
 
 def test_the_cpu_limit_takes_one_process() -> None:
     with begun(policy={"limits": {"cpu_time_s": 2}}) as env:
-        observation, _, _, truncated, info = env.step([LIVE, LIVE, LIVE, SPIN])
-        assert truncated.tolist() == [False, False, True, True]
-        assert observation[:, 1].tolist() == [1, 1, 0, 0]
-        assert restarted(info)
+        came_back(env.step([LIVE, LIVE, LIVE, SPIN]), [1, 1, 0, 0])
 
 
 @both
@@ -420,7 +411,7 @@ def test_a_late_sibling_is_a_timeout_all_the_same(env: Any) -> None:
     assert inside.state(env) is State.LATE
     observation, _ = env.reset(seed=SEED)
     assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
-    assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
+    goes_on(env)
 
 
 def test_budget_ends_in_the_death_itself() -> None:
@@ -452,12 +443,10 @@ def test_lent_observations_come_back_too() -> None:
 
 def test_an_environment_with_a_step_of_its_own_comes_back_whole() -> None:
     with begun(shards=1, env_kwargs={"form": "whole"}) as env:
-        observation, rewards, _, truncated, info = env.step(LAST_DIES)
-        assert truncated.all()
-        assert not rewards.any()
-        assert restarted(info, slice(4))
-        assert observation[:, 1].tolist() == [0, 0, 0, 0]
-        assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
+        got = env.step(LAST_DIES)
+        came_back(got, [0, 0, 0, 0], ALL)
+        assert not got[1].any()
+        goes_on(env)
 
 
 def test_environments_of_one_jail_come_back_each_on_its_own() -> None:
@@ -466,10 +455,8 @@ def test_environments_of_one_jail_come_back_each_on_its_own() -> None:
         first, second = suites["suite"]["a"], suites["suite"]["b"]
         for env in (first, second):
             env.reset(seed=SEED)
-        dead, other = first.step(LAST_DIES), second.step(ALL_LIVE)
-        for _, _, _, truncated, info in (dead, other):
-            assert truncated.all()
-            assert restarted(info, slice(4))
+        for got in first.step(LAST_DIES), second.step(ALL_LIVE):
+            came_back(got, rows=ALL)
         assert not first.step(ALL_LIVE)[3].any()
 
 
@@ -512,7 +499,7 @@ def test_interrupted_in_coming_back_it_starts_afresh(tmp_path: Path) -> None:
             coming.join()
             assert inside.state(env) is State.LATE
             env.reset(seed=SEED)
-            assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
+            goes_on(env)
     finally:
         signal.signal(signal.SIGALRM, before)
 
