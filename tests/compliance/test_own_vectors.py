@@ -358,9 +358,7 @@ def _side_by_side(spans: Any) -> int:
 
 @pytest.mark.skipif(not hasattr(gym.vector, "AutoresetMode"), reason="an argument of Gymnasium 1.4")
 @pytest.mark.parametrize("bound", [1, 2])
-def test_no_more_are_stepped_at_a_time_than_the_repository_permits(
-    bound: int, tmp_path: Path
-) -> None:
+def test_no_more_step_at_a_time_than_the_repository_permits(bound: int, tmp_path: Path) -> None:
     """``max_concurrency``, whatever the number of workers; results are the same."""
     folder = write_repository(tmp_path, _TIMED)
     rewards = []

@@ -165,9 +165,7 @@ def test_the_compose_file_keeps_its_clients(engine: Engine, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("version", ["1.30", "1.37"])
-def test_the_pods_of_the_ray_cluster_are_what_kubernetes_takes(
-    version: str, tmp_path: Path
-) -> None:
+def test_the_pods_of_the_ray_cluster_fit_kubernetes(version: str, tmp_path: Path) -> None:
     """Its own schemas know no RayCluster, and each pod that this makes; and what else is there."""
     if shutil.which("kubernetes-validate") is None:
         pytest.skip("needs kubernetes-validate")
@@ -192,9 +190,7 @@ def test_the_pods_of_the_ray_cluster_are_what_kubernetes_takes(
 
 @pytest.mark.parametrize("manifests", ["kubernetes.yaml", "fleet.yaml"])
 @pytest.mark.parametrize("version", ["1.30", "1.37"])
-def test_the_manifests_are_what_kubernetes_takes(
-    version: str, manifests: str, tmp_path: Path
-) -> None:
+def test_the_manifests_fit_kubernetes(version: str, manifests: str, tmp_path: Path) -> None:
     """By its own schemas, where a field that is misspelt, or of another type, is refused."""
     if shutil.which("kubernetes-validate") is None:
         pytest.skip("needs kubernetes-validate")

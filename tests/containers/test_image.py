@@ -135,7 +135,7 @@ def test_every_package_is_pinned_and_the_image_bears_the_lock(
     assert again == {**derived, "built": False}
 
 
-def test_nothing_runs_at_the_start_of_a_derived_interpreter(
+def test_nothing_runs_as_a_derived_interpreter_starts(
     derived: dict[str, Any], engine: Engine
 ) -> None:
     named = ("-name", "*.pth", "-o", "-name", "sitecustomize*", "-o", "-name", "usercustomize*")

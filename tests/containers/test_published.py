@@ -84,7 +84,7 @@ def test_a_client_without_linux_gets_the_same_steps(system: str) -> None:
     assert " passed" in done.stdout
 
 
-def test_it_is_shown_nothing_and_reached_from_here_alone(
+def test_it_is_shown_nothing_and_reached_from_here(
     published: DockerSandbox, engine: Engine
 ) -> None:
     """One volume without a name, a port on loopback, and no secret key in what others can see."""

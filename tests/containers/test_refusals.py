@@ -84,9 +84,7 @@ def test_a_wall_that_is_missing_is_noticed(
     assert nothing_left(engine)
 
 
-def test_a_path_that_is_granted_is_there_and_no_other(
-    docker: DockerSandbox, open_ground: Path
-) -> None:
+def test_a_granted_path_is_there_and_no_other(docker: DockerSandbox, open_ground: Path) -> None:
     (open_ground / "given").write_text("of the caller's")
     policy = {"readable": [str(open_ground)]}
     with started(sample("counter"), sandbox=docker, policy=policy, seed=0):

@@ -75,9 +75,7 @@ def test_a_replay_dies_at_the_same_step(
 
 
 @pytest.mark.parametrize(("actions", "ending"), [("dict", "memory"), ("text", "segfault")])
-def test_every_ending_and_every_action_comes_again(
-    tmp_path: Path, actions: str, ending: str
-) -> None:
+def test_every_ending_and_action_comes_again(tmp_path: Path, actions: str, ending: str) -> None:
     """Signals and memory; actions in mappings, and such as have no fixed layout."""
     limits = {"memory_bytes": 400 << 20}
     with brittle(tmp_path, actions, ending, n_envs=2, policy={"limits": limits}) as suites:

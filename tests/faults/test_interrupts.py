@@ -76,9 +76,7 @@ def test_a_second_ctrl_c_in_recovery_leaves_a_usable_environment(
 
 
 @pytest.mark.parametrize("why", ["it has died", "there is no room"])
-def test_ctrl_c_while_what_was_started_ahead_is_given_up(
-    why: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_while_a_prewarmed_task_ends(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     make_env(sample("counter"), n_envs=2).close()  # known from here on: it starts later
     with make_env(sample("counter"), n_envs=2) as suites:
         env = suites.env
@@ -98,7 +96,7 @@ def test_ctrl_c_while_what_was_started_ahead_is_given_up(
 
 
 @pytest.mark.parametrize("moment", ["amid the frames", "when all is sent"])
-def test_ctrl_c_in_sending_a_step_leaves_a_late_reply(
+def test_ctrl_c_in_sending_leaves_a_late_reply(
     moment: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if moment == "amid the frames":  # to half a message, and to what follows it, nothing is said
@@ -168,9 +166,7 @@ def close_during_reset(env: Any, inside: Inside) -> None:
 
 
 @pytest.mark.parametrize("restart", ["on_reset", "transparent"])
-def test_close_ends_the_wait_before_a_restart(
-    restart: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_close_ends_a_wait_for_a_restart(restart: str, monkeypatch: pytest.MonkeyPatch) -> None:
     waiting = Inside(lambda *_: 3600.0)
     waiting.leave()
     policy = {"restart": restart, "crash_history": 0}

@@ -315,9 +315,7 @@ def test_attributes_are_set_again_as_they_were_sent() -> None:
         assert [one["goal"].tolist() for one in env.get_attr("goals")] == [[0, 0]] * 4
 
 
-def test_an_attribute_that_cannot_be_set_again_is_left_out(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_an_attribute_that_cannot_be_set_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
     with begun() as env:
         env.set_attr("drawn_so_far", 0.5)
         with caplog.at_level("WARNING", "envhub_sandbox.worker"):

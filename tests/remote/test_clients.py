@@ -101,9 +101,7 @@ def test_a_jail_cannot_be_asked_more_than_a_policy_may(mallory: Peer) -> None:
         assert complaint in mallory.refused(m.OpenJail(**{**order, **changes})).message, changes
 
 
-def test_another_repository_is_a_snapshot_that_the_client_has_brought(
-    alice: Any, mallory: Peer
-) -> None:
+def test_another_repository_is_a_snapshot_of_the_clients(alice: Any, mallory: Peer) -> None:
     """Not a path of the server, and not what is not hers; her own, as the control."""
     mine = brought(mallory, b"x = 1")
 

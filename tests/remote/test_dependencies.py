@@ -67,7 +67,7 @@ def test_a_server_makes_what_the_repository_declares(
     assert remote.ask_facts(permitting.sandbox()).dependencies
 
 
-def test_an_environment_of_a_package_needs_no_repository(
+def test_a_packaged_environment_needs_no_repository(
     permitting: Listening, real_index: Index
 ) -> None:
     """The server installs the package, and the jail there imports it."""
@@ -81,9 +81,7 @@ def test_an_environment_of_a_package_needs_no_repository(
         assert "far-carts==1.0" in suites.provenance["installed"]["packages"]
 
 
-def test_what_cannot_be_made_is_told_here(
-    permitting: Listening, real_index: Index, tmp_path: Path
-) -> None:
+def test_what_fails_there_is_told(permitting: Listening, real_index: Index, tmp_path: Path) -> None:
     """With the lines of the repository that it is about; and a version is asked for, not a path."""
     folder = write_repository(tmp_path / "repo", ENV, requirements__txt="wanted==3.0\n")
     with refused_dependency("resolution", match=r"line 1 of requirements\.txt") as caught:
@@ -176,9 +174,7 @@ def test_orders_are_bounded(idle: Packages, monkeypatch: pytest.MonkeyPatch) -> 
         idle.need(b"a", order("another"), ())
 
 
-def test_what_nobody_asks_for_any_more_is_given_up(
-    idle: Packages, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_nobody_asks_for_is_given_up(idle: Packages, monkeypatch: pytest.MonkeyPatch) -> None:
     """The program ends, and the next in line has its turn."""
     monkeypatch.setattr(server_side, "MAX_AT_WORK", 1)
     clock = [time.monotonic()]  # an order notes by itself when it came: this is not another time
@@ -199,9 +195,7 @@ def test_what_nobody_asks_for_any_more_is_given_up(
     assert eventually(begun)
 
 
-def test_nobody_keeps_others_waiting_who_have_room(
-    idle: Packages, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nobody_holds_others_who_have_room(idle: Packages, monkeypatch: pytest.MonkeyPatch) -> None:
     """A key has one program at work, all together a few; who waits hears how many are before."""
     monkeypatch.setattr(server_side, "MAX_AT_WORK", 2)
     begun, command = [], server_side.command
@@ -224,9 +218,7 @@ def test_nobody_keeps_others_waiting_who_have_room(
     assert len(begun) == 2
 
 
-def test_an_order_that_takes_too_long_is_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_order_that_takes_long_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Though somebody asks for it all the time: the operator says how long."""
     monkeypatch.setattr(server_side, "command", lambda: SLEEPING)
     clock = [time.monotonic()]

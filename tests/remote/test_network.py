@@ -93,9 +93,7 @@ def test_nobody_at_the_other_end_is_said_to_be_so(
         make_env(repository, sandbox=server.sandbox(endpoint=endpoint))
 
 
-def test_a_connection_that_breaks_between_steps_is_made_anew(
-    server: Listening, repository: Path
-) -> None:
+def test_a_connection_that_breaks_is_made_anew(server: Listening, repository: Path) -> None:
     """Without another host: the wire breaks, the session is found again."""
     with (
         relay(server.port) as wire,
@@ -124,9 +122,7 @@ def test_a_long_step_is_no_lost_connection(server: Listening, repository: Path) 
     assert steps()
 
 
-def test_a_client_that_was_silent_for_too_long_is_told_so(
-    impatient: Listening, repository: Path
-) -> None:
+def test_a_client_that_was_silent_is_told_so(impatient: Listening, repository: Path) -> None:
     """Its jail was ended; when it comes back it hears why."""
     with started(repository, sandbox=impatient.sandbox()) as env:
         inside.fall_silent(env)

@@ -98,9 +98,7 @@ def test_what_was_not_asked_for_is_refused(uploads: Uploads) -> None:
         uploads.put(OWNER, ALICE, m.PutBlob(sha256, 0), bytes(MAX_PIECE_BYTES + 1))
 
 
-def test_few_files_are_on_their_way_at_once(
-    uploads: Uploads, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_few_files_are_begun_at_once(uploads: Uploads, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each that is begun is a file on disk and a running hash."""
     monkeypatch.setattr(f"{Uploads.__module__}.MAX_PARTIAL", 1)
     uploads.offer(OWNER, ALICE, offer(("a", b"12345"), ("b", b"54321")), ())
@@ -227,9 +225,7 @@ def _no_links(*_: object) -> None:
     raise OSError(errno.EMLINK, "too many links")
 
 
-def test_snapshots_and_their_folders_are_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_snapshots_and_folders_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The longest unused go; paths of too many steps are refused before any is made."""
     monkeypatch.setattr("envhub_worker.extras.access.store.uploads.MAX_TREES", 2)
     uploads = Uploads(tmp_path / "store", Quotas())

@@ -98,9 +98,7 @@ def test_an_asset_that_lies_about_its_hashes(
     assert followed(stub_hub, tmp_path / "control", 1) == ["other bytes"]
 
 
-def test_a_card_that_declares_ten_thousand_assets(
-    stub_hub: StubHub, make: Make, tmp_path: Path
-) -> None:
+def test_a_card_declares_ten_thousand_assets(stub_hub: StubHub, make: Make, tmp_path: Path) -> None:
     """The Hub is asked for none of them; a loader asks for one after the other."""
     for number in range(5):
         stub_hub.add(f"org/many{number}", {"x": "x"})
@@ -197,9 +195,7 @@ def test_what_the_callers_login_has_brought_is_no_strangers(
         ("https://user:pw@evil.example/org/data", "holds"),
     ],
 )
-def test_a_card_that_names_what_is_no_asset(
-    stub_hub: StubHub, make: Make, asset: str, why: str
-) -> None:
+def test_a_card_names_what_is_no_asset(stub_hub: StubHub, make: Make, asset: str, why: str) -> None:
     """Its own id at another commit, a moving revision, paths, and other hosts: nothing is asked."""
     with pytest.raises(HubReferenceError, match=why) as caught:
         make(asset)

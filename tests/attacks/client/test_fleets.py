@@ -141,7 +141,7 @@ OWN: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("what", OWN)
-def test_infos_of_others_are_refused(
+def test_others_infos_refused(
     liar: LyingServer, honest: LyingServer, folder: str, what: str
 ) -> None:
     """Where infos do not fit together they are asked for one by one, and each is of a row."""

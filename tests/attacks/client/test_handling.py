@@ -190,9 +190,7 @@ def test_what_a_signal_handler_raises_in_a_wait_passes(liar: LyingServer, folder
 
 
 @pytest.mark.parametrize("key", [(1, 2), frozenset({1, 2}), range(3)], ids=repr)
-def test_keys_that_are_no_text_harm_nobody(
-    liar: LyingServer, folder: str, other: Any, key: object
-) -> None:
+def test_keys_of_no_text_harm_none(liar: LyingServer, folder: str, other: Any, key: object) -> None:
     """Infos with such a key come the third time as the first, and others step in between."""
     liar.lies[m.Step] = relayed(step_done(info={"visits": {key: 1}}))
     with started(liar, folder) as env:
@@ -250,7 +248,7 @@ ODD: dict[str, Any] = {
 
 @pytest.mark.parametrize("shardable", [False, True])
 @pytest.mark.parametrize("place", ["observation", "final_obs"])
-def test_odd_observations_of_graphs(
+def test_odd_graph_observations(
     liar: LyingServer, folder: str, shardable: bool, place: str
 ) -> None:
     """Where members get their class back, any value is taken as it is, or refused."""

@@ -83,9 +83,7 @@ def test_a_last_observation_that_is_missing_is_refused(liar: LyingServer, folder
         assert isinstance(refuses(lambda: env.step(action)), RemoteProtocolError)
 
 
-def test_pickles_in_infos_apart_are_never_loaded(
-    liar: LyingServer, folder: str, tmp_path: Path
-) -> None:
+def test_pickles_in_infos_are_never_loaded(liar: LyingServer, folder: str, tmp_path: Path) -> None:
     """The control loads one."""
     canary = tmp_path / "executed"
     with _single(liar, folder) as env:

@@ -112,9 +112,7 @@ def test_pickles_in_manifests_are_never_loaded(
     assert not canary.exists()
 
 
-def test_pickle_in_place_of_a_reply_is_never_loaded(
-    liar: LyingServer, folder: str, tmp_path: Path
-) -> None:
+def test_pickle_for_a_reply_is_never_loaded(liar: LyingServer, folder: str, tmp_path: Path) -> None:
     """Nor is one that comes instead of a message, as frames of older protocols did."""
     canary = tmp_path / "executed"
     data = cloudpickle.dumps(Canary(canary))
@@ -239,9 +237,7 @@ OTHERS: dict[str, tuple[type[m.Message], m.Message]] = {
 
 
 @pytest.mark.parametrize("what", list(OTHERS))
-def test_another_environment_than_remembered_is_refused(
-    liar: LyingServer, folder: str, what: str
-) -> None:
+def test_another_environment_is_refused(liar: LyingServer, folder: str, what: str) -> None:
     """Whichever way it shows that what a jail holds is not what the manifest says."""
     opened(liar, folder).close()
     asked, answer = OTHERS[what]
@@ -273,9 +269,7 @@ DISAGREEING: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("what", list(DISAGREEING))
-def test_manifest_that_contradicts_itself_does_no_harm(
-    liar: LyingServer, folder: str, what: str
-) -> None:
+def test_contradictory_manifest_does_no_harm(liar: LyingServer, folder: str, what: str) -> None:
     """Single and batched spaces that do not belong together: an error, or what one has."""
     liar.lies[m.Load] = relayed(described(changed(**DISAGREEING[what])))
 
@@ -324,9 +318,7 @@ def test_malformed_answers_are_refused(liar: LyingServer, folder: str, what: str
 @pytest.mark.parametrize(
     "what", ["nothing", "noise", "no message", "a thousand frames", "nested a million deep"]
 )
-def test_malformed_answers_of_the_server_are_refused(
-    liar: LyingServer, folder: str, what: str
-) -> None:
+def test_malformed_server_answers_are_refused(liar: LyingServer, folder: str, what: str) -> None:
     """The same where the server's own message belongs; some of them only make the client wait."""
     frames = DOCUMENTS[what]()
     liar.lies[m.Reset] = lambda asked: [frames]
@@ -351,7 +343,7 @@ def test_malformed_answers_of_the_server_are_refused(
     ],
     ids=lambda reply: type(reply).__name__,
 )
-def test_answers_of_another_kind_are_refused(
+def test_answers_of_other_kinds_are_refused(
     liar: LyingServer, folder: str, reply: m.Message
 ) -> None:
     liar.lies[m.Step] = relayed(reply)
@@ -419,7 +411,7 @@ def test_flood_of_unasked_answers_is_bounded(liar: LyingServer, folder: str) -> 
 @pytest.mark.parametrize(
     "parts", [(), (0,), (-1,), (2,), (1, 1), (2**62,), (1, -1, 1)], ids=lambda parts: str(parts)
 )
-def test_parts_that_do_not_add_up_are_refused(
+def test_wrong_sums_of_parts_refused(
     liar: LyingServer, folder: str, parts: tuple[int, ...]
 ) -> None:
     """Nor more answers than runners were asked, each of which would do."""

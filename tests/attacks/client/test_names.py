@@ -118,9 +118,7 @@ def asked_for(liar: LyingServer) -> set[str]:
 
 
 @pytest.mark.parametrize("wrap", [lambda env: env, VectorWrapper, Forwarding, lambda e: e.envs[0]])
-def test_deepcopy_hands_nothing_over(
-    liar: LyingServer, folder: str, wrap: Callable[[Any], Any]
-) -> None:
+def test_deepcopy_hands_no_more(liar: LyingServer, folder: str, wrap: Callable[[Any], Any]) -> None:
     """Copying a config that holds an environment does not send the rest of it to the jail."""
     with greedy(liar, folder) as suites:
         copied = copy.deepcopy([TOKEN, wrap(suites.env)])

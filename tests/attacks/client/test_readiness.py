@@ -211,9 +211,7 @@ NEVER = [
 
 
 @pytest.mark.parametrize(("lane", "mode"), NEVER)
-def test_who_is_never_ready_holds_nobody_up(
-    strict: Arena, home: Path, lane: str, mode: str
-) -> None:
+def test_who_is_never_ready_holds_none_up(strict: Arena, home: Path, lane: str, mode: str) -> None:
     folder = liar(home, mode)
     with among(strict, folder, lane) as suites:
         found = Among(suites.env)
@@ -287,9 +285,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("lane", "mode"), BROKEN)
-def test_who_breaks_a_rule_is_given_up_alone(
-    strict: Arena, tmp_path: Path, lane: str, mode: str
-) -> None:
+def test_who_breaks_a_rule_ends_alone(strict: Arena, tmp_path: Path, lane: str, mode: str) -> None:
     with among(strict, liar(tmp_path, mode), lane) as suites:
         found = Among(suites.env)
         given_up = [one for one in found.others_go_on() if isinstance(one, EnvHubError)]

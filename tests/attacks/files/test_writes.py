@@ -45,9 +45,7 @@ def open_file(path: Path, text: str) -> Path:
         ("/dev/shm", "/dev/shm/envhub-attack-{token}"),  # a jail has its own
     ],
 )
-def test_files_outside_cannot_be_written(
-    jail: OpenJail, home: Path, title: str, place: str
-) -> None:
+def test_files_outside_are_not_written(jail: OpenJail, home: Path, title: str, place: str) -> None:
     path = home / place.format(token=token())
     try:
         jail.attack(
@@ -73,9 +71,7 @@ def test_files_outside_cannot_be_written(
         ("the store of snapshots", "{cache}/snapshots/planted"),
     ],
 )
-def test_files_outside_cannot_be_created(
-    jail: OpenJail, home: Path, title: str, folder: str
-) -> None:
+def test_no_files_are_created_outside(jail: OpenJail, home: Path, title: str, folder: str) -> None:
     """No new file appears in a folder that everybody may write, nor in our own caches."""
     place = Path(folder.format(home=home, cache=cache_root()))
     ours = not place.exists()

@@ -20,9 +20,7 @@ FAMILY = "AF_UNIX sockets"
         ("a service in the home", "{home}/service.sock"),
     ],
 )
-def test_socket_files_cannot_be_connected_to(
-    jail: OpenJail, home: Path, title: str, place: str
-) -> None:
+def test_socket_files_accept_nobody(jail: OpenJail, home: Path, title: str, place: str) -> None:
     path = Path(place.format(run=run_folder(), tmp=f"/tmp/ssh-{token()[:8]}", home=home))
     path.parent.mkdir(exist_ok=True)
     try:

@@ -128,9 +128,7 @@ def test_what_a_build_reads_tells_and_writes(
     arena.judge("write into another package's cache", "succeeds", written, "")
 
 
-def test_a_build_that_never_ends(
-    arena: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_endless_build(arena: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     alias = new_alias()
     files = backend("hostile", further=ENDLESS.format(alias=alias))
     process = building(tmp_path / "control", files)

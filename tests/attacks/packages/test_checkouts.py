@@ -77,9 +77,7 @@ def test_no_program_of_a_checkout_runs(
     assert not ran(program)
 
 
-def test_a_checkout_does_not_say_which_folder_is_looked_at(
-    checkout: GitRepository, tmp_path: Path
-) -> None:
+def test_a_checkout_does_not_choose_the_folder(checkout: GitRepository, tmp_path: Path) -> None:
     (tmp_path / "home").mkdir()
     (tmp_path / "home/secret.txt").write_text("secret")
     checkout.git("config", "core.worktree", str(tmp_path / "home"))

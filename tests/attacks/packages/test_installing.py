@@ -92,9 +92,7 @@ def what_starts_by_itself(folder: Path, traces: Path) -> Path:
     return make_wheel(folder, "bait", "1.0", {**BAIT, **files})
 
 
-def test_what_an_interpreter_runs_at_its_start(
-    real_index: Index, tmp_path: Path, traces: Path
-) -> None:
+def test_what_an_interpreter_starts_with(real_index: Index, tmp_path: Path, traces: Path) -> None:
     """``.pth``, ``sitecustomize``, ``usercustomize``: no interpreter outside of a jail has them."""
     wheel = what_starts_by_itself(real_index.folder, traces)
     python = virtual_environment(tmp_path / "control", [wheel])
@@ -111,9 +109,7 @@ def test_what_an_interpreter_runs_at_its_start(
     assert sprung(traces) == set()
 
 
-def test_a_plugin_of_a_package_that_is_loaded_early(
-    real_index: Index, tmp_path: Path, traces: Path
-) -> None:
+def test_a_plugin_that_is_loaded_early(real_index: Index, tmp_path: Path, traces: Path) -> None:
     files = {**BAIT, "trap_plugin.py": trap(traces, "plugin") + "def register(): pass\n"}
     files["bait-2.0.dist-info/entry_points.txt"] = (
         "[gymnasium.envs]\n__root__ = trap_plugin:register\n"
@@ -211,9 +207,7 @@ def set_trap(kind: str, folder: Path, traces: Path) -> str:
 
 
 @pytest.mark.parametrize("kind", ["of the index", *LINES])
-def test_what_would_be_built_is_not(
-    real_index: Index, tmp_path: Path, traces: Path, kind: str
-) -> None:
+def test_nothing_is_built_here(real_index: Index, tmp_path: Path, traces: Path, kind: str) -> None:
     """A build runs what the package says: an index's source in a jail, and others not at all."""
     if kind == "of the index":
         line, made = "trapped", source(tmp_path / "source", traces)
@@ -299,7 +293,7 @@ def test_a_compiler_that_is_taken_over_has_only_the_folder(tmp_path: Path) -> No
 # --- on another host ----------------------------------------------------------------------------
 
 
-def test_a_server_on_another_host_runs_none_of_it(
+def test_a_server_elsewhere_runs_none_of_it(
     real_index: Index, tmp_path: Path, traces: Path
 ) -> None:
     """What it installs for a client lies where no interpreter of its own looks."""

@@ -31,7 +31,7 @@ def pair(other: Neighbour) -> Iterator[Pair]:
 
 
 @pytest.mark.parametrize("title", READS)
-def test_memory_and_files_of_another_jail_cannot_be_read(
+def test_memory_and_files_of_another_jail_are_closed(
     jail: OpenJail, pair: Pair, title: str
 ) -> None:
     payload, names = READS[title]

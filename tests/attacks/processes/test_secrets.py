@@ -53,9 +53,7 @@ def test_nothing_of_ours_has_the_token(arena: Arena, hub_token: str) -> None:
         ("read /proc/<client>/cmdline", "command_lines_of_others"),
     ],
 )
-def test_environments_and_command_lines_are_closed(
-    jail: OpenJail, title: str, payload: str
-) -> None:
+def test_environments_and_arguments_are_closed(jail: OpenJail, title: str, payload: str) -> None:
     """What a process of the same user was started with, a password perhaps, cannot be read."""
     with victim(token()) as target:
         jail.steal(title, payload, target.secret, pid=target.pid)

@@ -126,9 +126,7 @@ def test_observations_that_are_not_checked_are_noticed(
     assert "where" in first_wrong(recorded, "results")
 
 
-def test_a_memory_that_fails_is_noticed(
-    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failing_memory_is_noticed(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
     assert first_wrong(recorded, "unpack") == ""
     monkeypatch.setattr(*inside.FORMS, message.Forms())
     monkeypatch.setattr(message, "Incoming", Forgetful)

@@ -139,7 +139,7 @@ BOTH = [(99, 0), (slabs.DONE, slabs.INFO_BYTES + 1), (slabs.DONE, 2**64 - 1)]
         *(("answer", *words) for words in (*BOTH, (slabs.COLUMNS, 0), (slabs.DONE, 0))),
     ],
 )
-def test_an_impossible_header_is_refused(
+def test_impossible_headers_refused(
     shard: LaneShard, asked: str, outcome: int, length: int
 ) -> None:
     """Words out of range never become a slice or an allocation, of steps or messages."""
@@ -221,9 +221,7 @@ def test_columns_without_a_schema_are_refused(shard: LaneShard) -> None:
         shard.columns()
 
 
-def test_bytes_that_are_no_booleans_become_booleans(
-    shard: LaneShard, observations: ObservationSlab
-) -> None:
+def test_other_bytes_become_booleans(shard: LaneShard, observations: ObservationSlab) -> None:
     os.pwrite(observations.fd, b"\x02" * 4, observations.layout.results + 16)
     os.pwrite(observations.fd, b"\x02" * 16, 0)
     _, terminations, truncations = observations.results()
@@ -233,9 +231,7 @@ def test_bytes_that_are_no_booleans_become_booleans(
         assert set(array.tobytes()) == {1}
 
 
-def test_what_the_caller_has_is_not_rewritten(
-    shard: LaneShard, observations: ObservationSlab
-) -> None:
+def test_the_callers_results_are_its_own(shard: LaneShard, observations: ObservationSlab) -> None:
     """Results are copies: a later write of the jail changes nothing that was handed out."""
     rewards, terminations, _ = observations.results()
     observation = observations.take()

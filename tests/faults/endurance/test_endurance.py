@@ -30,9 +30,7 @@ def test_a_short_hour(capsys: pytest.CaptureFixture[str]) -> None:
         assert found[place]["deaths"] > 0
 
 
-def test_the_monkey_would_notice_a_death_that_nobody_caused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_monkey_would_notice_an_uncaused_death(monkeypatch: pytest.MonkeyPatch) -> None:
     one = monkey.Monkey("process", environments=1, seed=0, kill_every=3)
     monkeypatch.setattr(monkey.Subject, "doubted", lambda _: None)
     while not one.mismatches and one.counts["operations"] < 1000:

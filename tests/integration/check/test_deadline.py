@@ -137,9 +137,7 @@ def trickle() -> Iterator[bytes]:
         time.sleep(0.05)
 
 
-def test_a_download_that_hangs_is_ended(
-    stub_hub: StubHub, snapshot_store: Path, tmp_path: Path
-) -> None:
+def test_a_hanging_download_ends(stub_hub: StubHub, snapshot_store: Path, tmp_path: Path) -> None:
     stub_hub.add("org/slow", {"env.py": _ENV})
     pattern = r"GET .*env\.py"
     stub_hub.fail(pattern, 200, pieces=trickle)

@@ -182,9 +182,7 @@ def test_a_machine_that_is_slow_for_a_while_fails_nobody(
     assert ("endless" in {check for check, _ in report.passed}) is (found == set())
 
 
-def test_one_task_is_closed_before_the_next(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_task_is_closed_before_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else each would keep its jail, and there is room for two."""
     made, seen = list[Any](), list[str]()
 
@@ -244,9 +242,7 @@ def test_what_was_tried_is_told_of_what_dies(tmp_path: Path) -> None:
     assert {one.id for one in report.findings} == {"survives", "denied-network"}
 
 
-def test_an_author_does_not_say_how_he_is_judged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_author_does_not_set_his_rules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What he would allow himself fails, wherever one stands; the caller's own file allows it."""
     text = _HONEST.replace("self.count += 1", "raise RuntimeError('it broke')")
     says = "[check]\nsteps = 5\nallow = ['runs']\n"

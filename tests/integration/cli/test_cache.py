@@ -186,9 +186,7 @@ def test_environments_in_use_are_kept(environment: str) -> None:
     lock.release()
 
 
-def test_newer_versions_are_chosen_when_asked_for(
-    index: Index, environment: str, tmp_path: Path
-) -> None:
+def test_newer_versions_are_chosen_if_asked(index: Index, environment: str, tmp_path: Path) -> None:
     """And then the next ``make_env`` has them, too."""
     make_wheel(index.folder, "wanted", "2.0")
     folder = str(tmp_path / "repo")

@@ -131,9 +131,7 @@ def test_an_action_that_cannot_be_sent_is_sent_to_nobody(tmp_path: Path) -> None
         assert env.step((("a",), ("b",)))[0].tolist() == [1, 1]
 
 
-def test_what_has_no_fixed_layout_is_packed_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_messages_of_no_layout_pack_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_repository(tmp_path / "texts", _TEXTS)
     packed, pack = [], m.pack
 
@@ -190,9 +188,7 @@ def far() -> Iterator[OtherHost]:
         yield host
 
 
-def test_a_partition_moves_the_rows(
-    rows: Path, far: OtherHost, stays: Listening, serve: Serve
-) -> None:
+def test_a_partition_moves_rows(rows: Path, far: OtherHost, stays: Listening, serve: Serve) -> None:
     """A cable is out: the heartbeat says so, and the rows come back here; there nothing remains."""
     bind = f"tcp://{far.address}:5555"
     there = serve("there", "--idle-s", "20", bind=bind, prefix=far.prefix)

@@ -52,9 +52,7 @@ def test_a_full_server_is_followed_by_the_next(
         env.step(np.zeros(4, int))
 
 
-def test_no_room_anywhere_is_an_error_that_names_all(
-    rows: Path, serve: Callable[..., Listening]
-) -> None:
+def test_no_room_anywhere_is_told_of_all(rows: Path, serve: Callable[..., Listening]) -> None:
     """It is the one for which one may wait; nothing is left open of the workers that had room."""
     small = [serve(name, "--max-jails", "1") for name in ("one", "two")]
     with make_env(rows, n_envs=3, sandbox=[s.sandbox() for s in small], num_workers=3) as suites:

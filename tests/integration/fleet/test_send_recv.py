@@ -27,9 +27,7 @@ def _alone(rows: Path, count: int, steps: int) -> list[Any]:
 
 
 @pytest.mark.parametrize("workers", [1, 3])
-def test_many_steps_are_on_the_way_at_once(
-    rows: Path, servers: list[Listening], workers: int
-) -> None:
+def test_many_steps_are_under_way_now(rows: Path, servers: list[Listening], workers: int) -> None:
     """Each comes back in its turn, and is what it would be without the others; where all of them go
     by one connection, too."""
     nothing = np.zeros(6, np.int64)
@@ -66,7 +64,7 @@ def test_they_are_really_on_the_way_at_once(rows: Path, servers: list[Listening]
         assert [env.recv().observations[0, 1] for _ in range(AHEAD)] == list(range(4, AHEAD + 4))
 
 
-def test_a_lost_server_is_its_own(
+def test_a_server_is_lost_alone(
     rows: Path, stays: Listening, serve: Callable[..., Listening]
 ) -> None:
     """Those on the others go on, while it is found to be lost and after that."""
@@ -114,9 +112,7 @@ def test_a_silent_server_keeps_nobody_waiting(
         assert late[0].env_ids == (quiet,)
 
 
-def test_a_learner_may_think_for_longer_than_a_heartbeat(
-    rows: Path, servers: list[Listening]
-) -> None:
+def test_a_learner_may_think_past_a_heartbeat(rows: Path, servers: list[Listening]) -> None:
     place = servers[0].sandbox(heartbeat_s=1.0)
 
     def thinks() -> None:

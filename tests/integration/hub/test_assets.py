@@ -60,9 +60,7 @@ def make(stub_hub: StubHub, hub_cache: Path, own: StubRepository) -> Make:
 
 
 @pytest.mark.parametrize("ref", ["org/repo@v1.0", f"org/repo@{StubRepository({}).commit}"])
-def test_downloads_of_the_own_id_return_the_pinned_files(
-    make: Make, own: StubRepository, ref: str
-) -> None:
+def test_downloads_of_the_own_id_are_the_pin(make: Make, own: StubRepository, ref: str) -> None:
     """``snapshot_download`` and ``hf_hub_download`` find them, by no revision, main and commit, and
     by the tag of the reference; another one is not inside."""
     own.refs.add("v1.0")
@@ -77,9 +75,7 @@ def test_downloads_of_the_own_id_return_the_pinned_files(
 
 
 @pytest.mark.parametrize("kind", ["space", "dataset"])
-def test_other_types_of_repository_find_themselves(
-    make: Make, stub_hub: StubHub, kind: str
-) -> None:
+def test_other_repository_types_find_themselves(make: Make, stub_hub: StubHub, kind: str) -> None:
     code = ENV.replace("snapshot_download(OWN)", f"snapshot_download('org/x', repo_type={kind!r})")
     stub_hub.add("org/x", {"env.py": code}, kind)
     with make(f"{kind}s/org/x") as suites:
@@ -133,9 +129,7 @@ def test_assets_are_part_of_what_is_remembered_and_handed_on(make: Make) -> None
 
 
 @pytest.mark.parametrize("login", ["", "me:hf_secret@"])
-def test_a_card_declares_assets(
-    make: Make, stub_hub: StubHub, own: StubRepository, login: str
-) -> None:
+def test_a_cards_assets(make: Make, stub_hub: StubHub, own: StubRepository, login: str) -> None:
     """They are fetched with neither a token nor a mirror's login, and the provenance has them."""
     own.files["README.md"] = f"---\nenvhub:\n  assets: [org/data@{DATA}]\n---\n# x\n".encode()
     endpoint = stub_hub.endpoint.replace("://", f"://{login}")

@@ -165,9 +165,7 @@ def test_a_cache_of_the_hub_that_cannot_be_used_is_named(get: Fetch, tmp_path: P
     assert re.search(rf"NotADirectoryError: .*{tmp_path}/file.*HF_HOME", message), message
 
 
-def test_silent_hub_is_given_up(
-    stub_hub: StubHub, get: Fetch, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_silent_hub_is_left(stub_hub: StubHub, get: Fetch, monkeypatch: pytest.MonkeyPatch) -> None:
     """A Hub that accepts and never answers ends in a time-out, with the variable to raise."""
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_ETAG_TIMEOUT", 0.5)
     stub_hub.fail("/tree/", stall=True)
@@ -263,7 +261,7 @@ def test_password_in_the_endpoint_is_not_shown(
 
 
 @pytest.mark.parametrize("again", [True, False])
-def test_an_interrupt_waits_for_no_download(
+def test_interrupts_wait_for_no_download(
     stub_hub: StubHub, hub_cache: Path, *, again: bool
 ) -> None:
     files = {f"assets/{number}": str(number) for number in range(20)}

@@ -135,9 +135,7 @@ def test_branch_is_asked_for_every_time(olah: OlahServer, get: Fetch) -> None:
     assert contents(get("org/moving")) == {"env.py": b"2"}
 
 
-def test_missing_entry_lists_the_python_files_before_downloading(
-    olah: OlahServer, get: Fetch
-) -> None:
+def test_missing_entry_lists_python_files_before_downloading(olah: OlahServer, get: Fetch) -> None:
     """A wrong path is refused by the listing, with the paths that would work."""
     make(olah, "listing").commit({"envs/cartpole.py": "", "tools/x.py": "", "big.txt": "b"})
     before = len(olah.requests())
@@ -168,9 +166,7 @@ def test_threads_share_one_snapshot(olah: OlahServer, get: Fetch) -> None:
     assert [path.name for path in home.parent.iterdir()] == [home.name]
 
 
-def test_processes_share_one_snapshot(
-    olah: OlahServer, hub_cache: Path, snapshot_store: Path
-) -> None:
+def test_processes_share_a_copy(olah: OlahServer, hub_cache: Path, snapshot_store: Path) -> None:
     commit = make(olah, "processes").commit(FILES)
     code = (
         "import sys; from envhub_sandbox.hub.snapshot import fetch; "

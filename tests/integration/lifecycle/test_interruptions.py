@@ -40,9 +40,7 @@ def _made(way: str) -> Any:
 
 
 @ways
-def test_an_interrupted_start_leaves_nothing_behind(
-    nothing_more: Callable[[], bool], way: str
-) -> None:
+def test_an_interrupted_start_leaves_nothing(nothing_more: Callable[[], bool], way: str) -> None:
     """No use of the server, no jail, no descriptor; and what the next reset says is its own."""
     options = {"token": 5.0, "delay": 0.0}
     moment, came = 0, True
@@ -57,9 +55,7 @@ def test_an_interrupted_start_leaves_nothing_behind(
 
 
 @ways
-def test_an_interrupted_close_leaves_nothing_behind(
-    nothing_more: Callable[[], bool], way: str
-) -> None:
+def test_an_interrupted_close_leaves_nothing(nothing_more: Callable[[], bool], way: str) -> None:
     """No use of the server, no jail, no descriptor, once it is closed again, or nobody has it."""
     moment, came = 0, True
     while came:

@@ -133,9 +133,7 @@ def started(repository: Path, use_async_envs: bool, **env_kwargs: object) -> int
 
 
 @pytest.mark.parametrize(("context", "tasks"), [("fork", 1), ("spawn", 10)])
-def test_a_jail_starts_no_process_that_nobody_asked_for(
-    context: str, tasks: int, repository: Path
-) -> None:
+def test_a_jail_starts_no_unasked_process(context: str, tasks: int, repository: Path) -> None:
     """However many tasks there are, and however the repository wanted its processes started."""
     plain = started(repository, use_async_envs=False, context=None, tasks=1)
     assert started(repository, use_async_envs=True, context=context, tasks=tasks) == plain

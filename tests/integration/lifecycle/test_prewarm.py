@@ -239,9 +239,7 @@ def _begun_meanwhile(envs: Tasks, opened: Path) -> tuple[bool, bool]:
     return begun, waited
 
 
-def test_what_fails_is_raised_by_the_first_request_of_that_task(
-    tasks: Callable[..., Tasks],
-) -> None:
+def test_what_fails_is_raised_by_the_tasks_first_request(tasks: Callable[..., Tasks]) -> None:
     """Not by the task before, which goes on; and the one after it is unharmed."""
     bundles = set(_bundles())
     envs = tasks(3, n_envs=2, policy={"prewarm": 1}, env_kwargs={"fails": 1})

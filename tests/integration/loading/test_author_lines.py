@@ -87,9 +87,7 @@ def test_the_line_in_a_repository_of_the_hub(stub_hub: StubHub, hub_cache: Path)
 
 
 @pytest.mark.parametrize(("lane", "workers"), [("auto", 1), ("auto", 2), ("frames", 2)])
-def test_a_result_that_does_not_fit_leads_to_its_return(
-    tmp_path: Path, lane: str, workers: int
-) -> None:
+def test_a_result_that_does_not_fit_is_located(tmp_path: Path, lane: str, workers: int) -> None:
     """With the call, the sub-environment among all of them, and what its space says."""
     text = ENV.replace("return 0, {}", "self.angle = [0, 1.5][seed - 2]\n        return 0, {}")
     folder = repository(tmp_path, text.replace("turn(action)", "self.angle"))

@@ -143,7 +143,7 @@ def test_a_dataclass_arrives_as_one_of_its_name(tmp_path: Path) -> None:
     assert found["vars"] == sorted(names)
 
 
-def test_classes_that_exist_in_the_jail_are_used(
+def test_classes_that_the_jail_has_are_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """``isinstance`` holds, methods are theirs, and what was made here is equal to theirs there."""

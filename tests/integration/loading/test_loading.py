@@ -328,9 +328,7 @@ class TestWhatGoesWrong:
         assert isinstance(caught.value.__cause__, KeyError)
         assert "line 2, in make_env" in vars(caught.value)["__notes__"][0]
 
-    def test_an_interpreter_without_our_packages_is_a_missing_dependency(
-        self, tmp_path: Path
-    ) -> None:
+    def test_an_interpreter_without_our_packages_is_refused(self, tmp_path: Path) -> None:
         """The text says what to install there, and nothing crashed: there is no bundle."""
         crashes = tmp_path / "crashes"
         venv.create(tmp_path / "bare", with_pip=False)

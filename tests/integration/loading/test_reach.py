@@ -65,9 +65,7 @@ def env(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 @pytest.mark.parametrize("name", ["model.xml", "data/a b.npy", "other.py", "lib/other.py"])
 @pytest.mark.parametrize("when", ["in make_env", "later"])
-def test_what_lies_beside_a_named_file_is_missed_with_a_word(
-    tmp_path: Path, name: str, when: str
-) -> None:
+def test_what_is_beside_a_named_file_is_missed_aloud(tmp_path: Path, name: str, when: str) -> None:
     """That it is there, why the code does not see it, and which reference shows it."""
     code = "sys.path.append('lib')\n__import__('oth' + 'er')"
     code = code if name.endswith("other.py") else f"open({name!r})"

@@ -115,7 +115,7 @@ def test_the_second_thread_is_refused_after_an_async_call(env: Any) -> None:
 
 @over_both_lanes
 @pytest.mark.parametrize("asks", ["recv", "send", "reset"])
-def test_a_second_thread_waits_for_a_send(
+def test_a_second_thread_waits_to_send(
     env: Any, monkeypatch: pytest.MonkeyPatch, asks: str
 ) -> None:
     """It finds no half of it, which would look like one that a Ctrl-C has left."""

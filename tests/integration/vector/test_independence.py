@@ -242,9 +242,7 @@ def test_results_are_those_of_gymnasium_in_every_use(
 
 
 @pytest.mark.parametrize("lane", ["auto", "frames"])
-def test_what_is_shared_later_is_said_once_and_separated_from_then_on(
-    repository: Path, lane: str
-) -> None:
+def test_what_is_shared_later_is_said_once_and_then_separated(repository: Path, lane: str) -> None:
     with make_env(repository, N_ENVS, use_async_envs=True, policy={"lane": lane}) as suites:
         env = suites.env
         env.reset(seed=1)

@@ -97,9 +97,7 @@ def test_large_and_small_answers_are_not_mixed_up(talker: Path, num_workers: int
 
 
 @pytest.mark.parametrize("lane", ["auto", "frames"])
-def test_ctrl_c_while_a_large_answer_is_taken_leaves_the_next_reset_its_own(
-    talker: Path, lane: str
-) -> None:
+def test_ctrl_c_in_a_large_answer_leaves_the_next_reset_its_own(talker: Path, lane: str) -> None:
     """What did not fit has been asked for by then: it is dropped with the answer, and the same
     process goes on."""
     with make_env(talker, 2, policy={"lane": lane}) as suites:
@@ -163,9 +161,7 @@ def test_a_reset_by_the_server_leaves_lent_batches_alone(talker: Path) -> None:
 
 
 @pytest.mark.parametrize("copy", [True, False])
-def test_a_masked_reset_after_a_failed_step_shows_the_last_observations(
-    talker: Path, copy: bool
-) -> None:
+def test_a_masked_reset_after_a_failure_shows_the_last_rows(talker: Path, copy: bool) -> None:
     with make_env(talker, 2, copy=copy) as suites:
         env = suites.env
         held = [env.reset()[0]]

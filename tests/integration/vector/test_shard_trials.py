@@ -41,9 +41,7 @@ def test_the_first_uses_try_all_ways_and_give_the_same(
     assert use(lane, 0)[0] in WAYS
 
 
-def test_an_environment_that_is_never_closed_counts(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Any
-) -> None:
+def test_what_is_never_closed_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     """A training may be killed: after enough steps it is noted what they took."""
     monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path))
     monkeypatch.setattr(shard_trials, "ways_to_cut", lambda count, cores: WAYS)

@@ -161,9 +161,7 @@ def test_an_evaluation_asks_for_its_task_but_twice(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("way", WAYS, ids=str)
-def test_what_is_absent_is_asked_for_until_that_is_watched(
-    folder: Path, way: dict[str, Any]
-) -> None:
+def test_what_is_absent_is_asked_for_until_watched(folder: Path, way: dict[str, Any]) -> None:
     """The error is then the same, each time another one; and the first that has it is noticed."""
     with make_env(folder, ENVS, **way) as suites:
         env = suites.env
@@ -245,7 +243,7 @@ def test_a_reply_that_is_lost_says_nothing(tmp_path: Path, way: str) -> None:
     [(WAYS[0], "on_reset", "reach"), *((way, "transparent", "set") for way in WAYS[1:])],
     ids=str,
 )
-def test_fresh_runners_are_asked_anew(
+def test_fresh_runners_are_asked(
     folder: Path, way: dict[str, Any], restart: str, then: str
 ) -> None:
     """What those that died have said no longer counts; only who is to be, is as it was set."""

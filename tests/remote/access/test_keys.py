@@ -125,9 +125,7 @@ def test_keys_are_found_in_the_configuration_folder(
         {"sandbox": "tcp://host:1 0123 no key"},
     ],
 )
-def test_what_cannot_be_reached_is_refused_at_once(
-    repository: Path, options: dict[str, str]
-) -> None:
+def test_what_nobody_reaches_is_refused_at_once(repository: Path, options: dict[str, str]) -> None:
     with pytest.raises(PolicyError):
         make_env(repository, **options)
 

@@ -98,9 +98,7 @@ def test_it_ends_with_its_stdin(
         (("--only-client", "00" * 32, "--insecure-loopback"), "has no keys"),
     ],
 )
-def test_what_contradicts_itself_is_refused(
-    tmp_path: Path, words: tuple[str, ...], text: str
-) -> None:
+def test_contradictions_are_refused(tmp_path: Path, words: tuple[str, ...], text: str) -> None:
     done = worker(
         "listen", "--bind", "tcp://127.0.0.1:*", "--state-dir", tmp_path / "state", *words
     )

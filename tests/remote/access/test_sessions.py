@@ -75,9 +75,7 @@ def test_the_place_of_a_program_that_ends_is_free_at_once(
         assert eventually(lambda: not narrow.sessions())
 
 
-def test_the_place_of_a_killed_program_is_for_whoever_needs_it(
-    narrow: Listening, repository: Path
-) -> None:
+def test_a_killed_programs_place_is_for_others(narrow: Listening, repository: Path) -> None:
     """Its jail stays, for it may be cut off only; the next of its key gets the place of both."""
     with at_work(narrow, repository) as killed:
         killed.kill()

@@ -100,9 +100,7 @@ def test_the_tests_of_clients_pass(system: str) -> None:
     assert " passed" in done.stdout
 
 
-def test_an_environment_lives_dies_and_starts_again(
-    system: str, server: Listening, tmp_path: Path
-) -> None:
+def test_it_lives_dies_and_starts_again(system: str, server: Listening, tmp_path: Path) -> None:
     """Reset, step, call, set_attr, a death, a restart, and two closes."""
     repository = write_repository(tmp_path / "repo", _DIES)
     said = elsewhere(system, _LIFE, *words(server), repository)
@@ -213,9 +211,7 @@ def test_help_is_there(system: str) -> None:
     assert done.stdout.count("Usage:") == len(asked)
 
 
-def test_a_client_leaves_nothing_but_its_cache(
-    system: str, server: Listening, tmp_path: Path
-) -> None:
+def test_a_client_leaves_only_its_cache(system: str, server: Listening, tmp_path: Path) -> None:
     """Which lies where that system has it; in the temporary folder nothing is left."""
     home, temporary = tmp_path / "home", tmp_path / "temporary"
     temporary.mkdir()

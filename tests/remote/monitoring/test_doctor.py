@@ -34,9 +34,7 @@ def alone(used: dict[str, int]) -> bool:
     return used["jails"] == used["sessions"] == 1
 
 
-def test_a_server_says_what_it_can_and_what_we_may_take(
-    server: Listening, repository: Path
-) -> None:
+def test_a_server_says_what_it_can_and_permits(server: Listening, repository: Path) -> None:
     with started(repository, sandbox=server.sandbox()):
         # what others have left goes when the server notices that they have gone
         assert eventually(lambda: alone(looked(server)[1]["used"]))

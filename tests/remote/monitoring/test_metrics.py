@@ -217,9 +217,7 @@ def test_a_huge_request_is_not_kept(one: Watched, good: Any) -> None:
         (b"x" * (MAX_REQUEST_BYTES + 1), 431),
     ],
 )
-def test_only_whole_requests_for_a_page_are_answered(
-    one: Watched, request_: bytes, status: int
-) -> None:
+def test_only_whole_requests_are_answered(one: Watched, request_: bytes, status: int) -> None:
     """Whatever else is sent; ``HEAD`` without the page."""
     with knock(one.port) as connection:
         with contextlib.suppress(ConnectionError):

@@ -76,7 +76,7 @@ def test_an_actor_is_where_ray_places_it(cluster: Any, repository: Path) -> None
 
 
 @pytest.mark.short
-def test_files_reach_a_node_once(
+def test_a_node_is_sent_once(
     cluster: Any, repository: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Servers on one node share what was verified here and brought there; another node has none."""
@@ -117,9 +117,7 @@ def test_what_no_node_has_room_for_is_told(cluster: Any, repository: Path) -> No
             assert only_server()
 
 
-def test_another_address_than_that_of_this_process_is_refused(
-    cluster: Any, repository: Path
-) -> None:
+def test_another_address_than_this_process_has_is_refused(cluster: Any, repository: Path) -> None:
     """It would be two clusters at once; the same one may be named."""
     with pytest.raises(PolicyError, match=r"ray\.shutdown"):
         make_env(repository, sandbox=RaySandbox(address="10.0.0.1:6379"))
