@@ -65,9 +65,7 @@ def environment(folder: Path, *packages: str) -> Path:
 def plays(folder: Path, package: Path, plugin: Path) -> None:
     """The end of the README's first command, with these installed instead of the checkout."""
     readme = (CHECKOUT / "README.md").read_text()
-    [command] = re.findall(
-        r"^python3 -m venv .*&& \.venv/bin/(envhub run .*)$", readme, re.MULTILINE
-    )
+    [command] = re.findall(r"^python3 -m venv .*&& \.venv/bin/(envhub run .*)$", readme, re.M)
     bin_folder = environment(folder / "venv", f"{package}[video]", str(plugin))
     shutil.copytree(CHECKOUT / "examples" / "cartpole", folder / "examples" / "cartpole")
     name, *arguments = command.split()

@@ -124,9 +124,7 @@ def test_so_do_attributes_and_options(env: SandboxVectorEnv) -> None:
 @pytest.mark.parametrize("own", [False, True])
 def test_so_do_arguments_of_make_env(folder: Path, own: bool) -> None:
     """In each process that calls it; and a mode of Gymnasium's is one."""
-    given = {
-        name.replace(" ", "_"): VALUES[name] for name in ("NamedTuple", "Counter", "dataclass")
-    }
+    given = {one.replace(" ", "_"): VALUES[one] for one in ("NamedTuple", "Counter", "dataclass")}
     env = made_of(
         folder,
         n_envs=2,

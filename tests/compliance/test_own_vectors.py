@@ -163,17 +163,15 @@ _RESETS = {
 @pytest.mark.parametrize("text", _RESETS)
 def test_the_api_of_old_is_named_with_its_line(tmp_path: Path, text: str) -> None:
     """What ``gym`` before 0.26 had, in an environment whose ``reset`` looks like today's."""
+    step = "step" in _RESETS[text]
     folder = write_repository(tmp_path, _OLD.replace("RESET", text))
     with make_env(folder) as suites:
-        if "step" in _RESETS[text]:
+        if step:
             suites.env.reset()
         with pytest.raises(RemoteEnvError, match=_RESETS[text]) as caught:
-            _ = suites.env.step([0]) if "step" in _RESETS[text] else suites.env.reset()
+            _ = suites.env.step([0]) if step else suites.env.reset()
     assert "0.26" in str(caught.value)
-    assert (caught.value.file, caught.value.line) == (
-        "env.py",
-        12 if "step" in _RESETS[text] else 9,
-    )
+    assert (caught.value.file, caught.value.line) == ("env.py", 12 if step else 9)
 
 
 _OF_OLD = """

@@ -109,12 +109,10 @@ class Entry:
         several = not self.told or self.told == "workers" or self.group == "vectors"
         arguments = {"n_envs": 2 if several else 1, "timeouts": timeouts, **self.arguments}
         settings = {"steps": 30, "resets": 2, "slow_step_s": _NEVER_S, **self.settings}
-        report = judge(
-            JudgeOptions(reference=str(self.write(folder)), arguments=arguments, **settings)
-        )
+        asked = JudgeOptions(reference=str(self.write(folder)), arguments=arguments, **settings)
         least = Severity.NOTE if self.told else Severity.WARNING
         # few are meant for LeRobot: the note that says so is of no concern here
-        return {one.id: one.text for one in report.failures(least, allowed={"lerobot"})}
+        return {one.id: one.text for one in judge(asked).failures(least, allowed={"lerobot"})}
 
     @property
     def right(self) -> frozenset[str]:

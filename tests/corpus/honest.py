@@ -467,7 +467,5 @@ HONEST: dict[str, Entry] = {
     "Gymnasium's running statistics": _normalised("NormalizeObservation"),
     "running statistics of rewards": _normalised("NormalizeReward"),
     "running statistics around others": _normalised("NormalizeReward", "NormalizeObservation"),
-    "an optional package": _env(
-        head="try:\n    import cupy\nexcept ImportError:\n    cupy = None\n"
-    ),
+    "an optional package": _env(head="try:\n import cupy\nexcept ImportError:\n cupy = None\n"),
 }

@@ -256,9 +256,7 @@ class Transparent(Attribution):
             return
         if usable and not self.lost and 1 not in self.over:
             self.lost = {0, 1} if self.shards == 1 else {1}
-        self.after(
-            lambda: self.env.step([[0.0, 0.0], [0.0, -1.0]]), lambda got: self.is_step(got, 0.0)
-        )
+        self.after(lambda: self.env.step([[0, 0.0], [0, -1.0]]), lambda got: self.is_step(got, 0.0))
 
 
 def _restarted(infos: dict[str, Any]) -> set[int]:

@@ -88,9 +88,7 @@ def alike(one: Any, other: Any) -> bool:
         same = one.dtype == other.dtype and one.shape == other.shape
         return same and one.tobytes() == other.tobytes()
     if isinstance(one, np.ndarray):
-        return one.shape == other.shape and alike(
-            one.reshape(-1).tolist(), other.reshape(-1).tolist()
-        )
+        return one.shape == other.shape and alike(one.ravel().tolist(), other.ravel().tolist())
     if isinstance(one, (list, tuple)):
         return len(one) == len(other) and all(map(alike, one, other))
     if isinstance(one, dict):

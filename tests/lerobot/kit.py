@@ -55,11 +55,7 @@ def run(program: str, olah: OlahServer, home: Path, *arguments: str) -> Any:
     ours = [Path(module.__file__).parents[1] for module in (envhub_sandbox, envhub_worker)]
     paths = [plugin, *ours, checkout] if own else [Path(str(overlay)), plugin]
     environment = {
-        **{
-            name: text
-            for name, text in os.environ.items()
-            if not name.startswith(("HF_", "HUGGING"))
-        },
+        **{one: text for one, text in os.environ.items() if not one.startswith(("HF_", "HUGGING"))},
         "PYTHONPATH": os.pathsep.join(map(str, paths)),
         "ENVHUB_CACHE": str(home / "store"),
         "HF_HOME": str(home / "hf"),

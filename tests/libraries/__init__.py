@@ -116,9 +116,7 @@ def main() -> None:
     parser.add_argument("--below", type=Path, help="a folder for the environments, 2 GB each")
     options = parser.parse_args()
     if unknown := set(options.libraries) - set(WANTED):
-        parser.error(
-            f"no such library: {', '.join(sorted(unknown))}; there are {', '.join(WANTED)}"
-        )
+        parser.error(f"no library {', '.join(sorted(unknown))}; there are {', '.join(WANTED)}")
     failed = []
     for library in options.libraries:
         with tempfile.TemporaryDirectory(prefix="rl-", dir=options.below) as name:

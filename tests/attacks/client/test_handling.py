@@ -199,12 +199,7 @@ def test_keys_of_no_text_harm_none(liar: LyingServer, folder: str, other: Any, k
             other.step(ACTIONS)
 
 
-RUNNERS: dict[str, tuple[Any, ...]] = {
-    "a list": ([],),
-    "a text": ("1",),
-    "none": (None,),
-    "a float": (1.0,),
-}
+RUNNERS = {"a list": ([],), "a text": ("1",), "none": (None,), "a float": (1.0,)}
 
 
 @pytest.mark.parametrize("what", list(RUNNERS))

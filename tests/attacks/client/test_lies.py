@@ -227,10 +227,7 @@ OTHERS: dict[str, tuple[type[m.Message], m.Message]] = {
     "an array": (m.LoadTask, m.Value(np.arange(2))),
     "a manifest": (m.LoadTask, m.LoadDone(manifest())),
     "fewer built": (m.Build, m.BuildDone(encode_env(env_manifest(num_envs=1)))),
-    "another mode built": (
-        m.Build,
-        m.BuildDone(encode_env(env_manifest(autoreset_mode="Disabled"))),
-    ),
+    "another mode": (m.Build, m.BuildDone(encode_env(env_manifest(autoreset_mode="Disabled")))),
     "nothing built": (m.Build, m.BuildDone({})),
     "a value built": (m.Build, m.Value(None)),
 }
@@ -291,9 +288,7 @@ DOCUMENTS: dict[str, Callable[[], Frames]] = {
     "too many fields": lambda: packed([m.StepDone.kind, *range(50)]),
     "nested a thousand deep": lambda: packed([m.Value.kind, deep(400)]),
     "nested a million deep": lambda: value(b"\x91" * 1_000_000 + b"\xc0"),
-    "a million empty maps": lambda: value(
-        b"\xdd" + struct.pack(">I", 4_000_000) + b"\x80" * 4_000_000
-    ),
+    "a million empty maps": lambda: value(b"\xdd" + struct.pack(">I", 4 * MIB) + b"\x80" * 4 * MIB),
     "an array that claims four billion": lambda: value(b"\xdd\xff\xff\xff\xff"),
     "an array of objects by hand": lambda: packed([m.Value.kind, ext(1, b"|O8")]),
     "an array that is not there": lambda: packed([m.Value.kind, ext(1, b"\x0b\x01" + b"\xff")]),
@@ -397,10 +392,7 @@ def test_stale_unasked_and_double_answers_are_dropped(liar: LyingServer, folder:
 def test_flood_of_unasked_answers_is_bounded(liar: LyingServer, folder: str) -> None:
     def lie(asked: Asked) -> list[Frames]:
         waste = step_done(info={"waste": np.zeros(MIB // 8)})
-        return [
-            *(asked.answer(waste, 2**40 + number) for number in range(300)),
-            asked.answer(asked.honest),
-        ]
+        return [*(asked.answer(waste, 2**40 + at) for at in range(300)), asked.answer(asked.honest)]
 
     liar.lies[m.Step] = lie
     with started(liar, folder) as env:
@@ -416,9 +408,7 @@ def test_wrong_sums_of_parts_refused(
 ) -> None:
     """Nor more answers than runners were asked, each of which would do."""
     frames = m.pack(step_done()) * len(parts)
-    liar.lies[m.Step] = lambda asked: [
-        [*m.pack_header(m.RelayDone(parts), asked.request_id), *frames]
-    ]
+    liar.lies[m.Step] = lambda one: [[*m.pack_header(m.RelayDone(parts), one.request_id), *frames]]
     with started(liar, folder) as env:
         assert isinstance(refuses(lambda: env.step(ACTIONS)), RemoteProtocolError)
 

@@ -238,9 +238,7 @@ def most_filters(run: Run) -> int:
     for pid in run.pids():
         with contextlib.suppress(OSError):
             status = Path(f"/proc/{pid}/status").read_text().splitlines()
-            found += [
-                int(line.split()[1]) for line in status if line.startswith("Seccomp_filters:")
-            ]
+            found += [int(one.split()[1]) for one in status if one.startswith("Seccomp_filters:")]
     return max(found)
 
 

@@ -72,9 +72,7 @@ def sprung(traces: Path) -> set[str]:
 
 def virtual_environment(folder: Path, wheels: list[Path]) -> Path:
     """An interpreter with these packages among its own: where pip would put them."""
-    subprocess.run(
-        [interpreters.own().path, "-m", "venv", "--without-pip", str(folder)], check=True
-    )
+    subprocess.run([interpreters.own().path, "-m", "venv", "--without-pip", folder], check=True)
     [site] = folder.glob("lib/python3*/site-packages")
     for wheel in wheels:
         shutil.unpack_archive(wheel, site, "zip")

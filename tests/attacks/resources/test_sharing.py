@@ -145,9 +145,7 @@ _MODULES = "import ctypes, fcntl, os, resource, signal, socket, sys\nlibc = ctyp
 def used_up(kind: str) -> bool:
     """Whether another program of this user gets nothing of a kind any more."""
     source = _MODULES + PROBES[kind]
-    done = subprocess.run(
-        [sys.executable, "-I", "-S", "-c", source, f"probe-{token()}"], check=False
-    )
+    done = subprocess.run([sys.executable, "-ISc", source, f"probe-{token()}"], check=False)
     assert done.returncode in (0, 1)
     return done.returncode == 1
 

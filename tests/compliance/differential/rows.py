@@ -129,9 +129,7 @@ class _Game:
 
     def _reset(self) -> str | None:
         seed = self._draw.randrange(99)
-        expected = [
-            one.ask("reset", seed=[seed + index for index in one.rows]) for one in self.slices
-        ]
+        expected = [one.ask("reset", seed=[seed + at for at in one.rows]) for one in self.slices]
         actual = _asked(self._env.reset, seed=seed)
         self._started = not isinstance(actual, Exception)
         return self._compare_all("reset", expected, actual)

@@ -75,11 +75,7 @@ def _make(cell: Cell, repository: Path) -> Any:
         n_envs=2,
         use_async_envs=cell.mode == "async",
         num_workers=2 if cell.mode == "async" else None,
-        env_kwargs={
-            "moment": row.moment,
-            "fault": row.fault,
-            "tasks": 2 if cell.mode == "suite" else 0,
-        },
+        env_kwargs={"moment": row.moment, "fault": row.fault, "tasks": 2 * (cell.mode == "suite")},
         policy={"restart": "on_reset", "lane": cell.lane},
         limits=_limits(row.fault),
         timeouts=Timeouts(

@@ -114,9 +114,7 @@ def test_a_folder_is_judged_as_its_commit(
     assert seen(reports[0]) == seen(reports[1])
     for report in reports:
         found = {one.file for one in report.findings if one.id == "source-process"}
-        assert found == {
-            f"{folder}/{name}.py" for folder, name in zip(_FOLDERS, _NAMES, strict=True)
-        }
+        assert found == {f"{where}/{name}.py" for where, name in zip(_FOLDERS, _NAMES, strict=True)}
         failing = {one.file for one in report.failures(Severity.ERROR)}
         tag = sys.implementation.cache_tag
         assert failing == {f"__pycache__/beside.{tag}.pyc", "without_source.pyc"}

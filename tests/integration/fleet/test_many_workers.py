@@ -73,11 +73,7 @@ def server() -> Iterator[LyingServer]:
 def test_hundreds_of_workers(server: LyingServer, tmp_path: Path) -> None:
     """Each row is where it belongs, in a reset and in a step; and all of it ends."""
     folder = write_repository(tmp_path, f"# {tmp_path}")
-    options: dict[str, Any] = {
-        "n_envs": WORKERS,
-        "num_workers": WORKERS,
-        "policy": {"lane": "frames"},
-    }
+    options = {"n_envs": WORKERS, "num_workers": WORKERS, "policy": {"lane": "frames"}}
     timeouts = {"startup_s": 300.0, "reset_s": 300.0, "step_s": 300.0}
     place = LyingSandbox(server)
     with make_env(folder, sandbox=[place, place], timeouts=timeouts, **options) as suites:

@@ -58,9 +58,7 @@ def core(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for file in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(checkout / file, source)
     with zipfile.ZipFile(built("wheel", source, root / "wheel")) as wheel:
-        assert not {"extras", "integrations"} & {
-            Path(name).parent.name for name in wheel.namelist()
-        }
+        assert not {"extras", "integrations"} & {Path(one).parent.name for one in wheel.namelist()}
         wheel.extractall(installed)
     return installed
 

@@ -89,9 +89,7 @@ def test_slabs_that_are_made_again_leave_nothing(env: Any, server: Listening) ->
     before = files(server)
     for _ in range(MANY):
         assert isinstance(share(env, [(0, 64)]), m.Done)
-    assert files(server) < before + MANY, (
-        "a connection may have come; each slab would be there still"
-    )
+    assert files(server) < before + MANY, "a connection may come; each slab would be there still"
 
 
 def test_what_is_made_for_a_jail_that_ends_goes_with_it(server: Listening) -> None:

@@ -40,9 +40,7 @@ def make_wheel(
     lines = ["Metadata-Version: 2.1", f"Name: {name}", f"Version: {version}"]
     lines += [f"Requires-Dist: {one}" for one in requires]
     lines += [f"Requires-Python: {python}"] if python else []
-    contents = {
-        path: text.encode() if isinstance(text, str) else text for path, text in given.items()
-    }
+    contents = {path: one.encode() if isinstance(one, str) else one for path, one in given.items()}
     contents[f"{info}/METADATA"] = "\n".join([*lines, "", ""]).encode()
     contents[f"{info}/WHEEL"] = (
         f"Wheel-Version: 1.0\nGenerator: tests\nRoot-Is-Purelib: true\nTag: {tag}\n".encode()
@@ -67,9 +65,8 @@ def repacked(folder: Path, name: str) -> Path:
     info = next(part for part in contents if part.endswith(".dist-info/METADATA")).split("/")[0]
     for extra in ("RECORD", "INSTALLER", "REQUESTED", "direct_url.json"):
         contents.pop(f"{info}/{extra}", None)
-    tags = [
-        line[5:] for line in contents[f"{info}/WHEEL"].decode().splitlines() if line[:5] == "Tag: "
-    ]
+    lines = contents[f"{info}/WHEEL"].decode().splitlines()
+    tags = [line[5:] for line in lines if line[:5] == "Tag: "]
     distribution = info.removesuffix(".dist-info")
     path = folder / f"{distribution}-{tags[0]}.whl"
     _write(path, contents, info)
