@@ -7,10 +7,8 @@ from collections.abc import Collection
 
 MEASURED = "memory measured by init"
 """The condition of a host that lets us make no control group: a plain user without delegation."""
-
 PLAIN = "a plain user"
 """The condition of a jail that runs as the user who also runs the caller's other programs."""
-
 _LOCKS = "no control group counts them, and no limit of the kernel's bounds them"
 _FLOCK = "flock takes no more than a descriptor; programs need it on their own files"
 
@@ -37,12 +35,9 @@ NOT_STOPPED: dict[str, dict[str, str]] = {
         "strict": "the driver maps what was exported (cudaIpcGetMemHandle) by its 64 bytes alone"
     },
 }
-
 MEASURED_ATTACKS = frozenset({"fork bomb", "thread bomb"})
 """What init measures now and then under ``no-userns`` without a control group: a burst between two
 looks gets through on a busy machine and is stopped on a quiet one, so neither is asserted there."""
-
-
 SHARED = {
     "stdin: /dev/null": {"init", "zygote"},
     "stdout: pipe": {"init"},

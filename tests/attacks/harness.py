@@ -27,10 +27,8 @@ from tests.support.processes import eventually
 HOSTILE = Path(__file__).with_name("hostile")
 USER = "root" if os.geteuid() == 0 else "user"
 TIMEOUTS = {"startup_s": 120.0, "call_s": 90.0, "reset_s": 90.0, "step_s": 90.0}
-
 OUTSIDE, ANSWER = "outside", "by its answer"
 """Who says whether an attack succeeded: the world around the jail, or the payload."""
-
 Succeeded = Callable[["Run"], object]
 
 

@@ -42,7 +42,6 @@ writes a table of every attack. Each attack runs twice in the same test: without
   table), so its failure inside proves nothing.
 """
 _START = "| attack |"
-
 Page = dict[str, dict[str, dict[str, str]]]
 
 

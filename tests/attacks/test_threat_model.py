@@ -10,7 +10,6 @@ from tests.attacks.expectations import MEASURED_ATTACKS, NOT_STOPPED, SHARED
 from tests.attacks.harness import Row
 
 pytestmark = pytest.mark.short
-
 DOCS = Path(__file__).parents[2] / "docs"
 
 

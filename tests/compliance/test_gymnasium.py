@@ -23,7 +23,6 @@ from tests.compliance.theirs.through_sandbox import vector
 from tests.remote.listening import Listening, listening
 
 Make = Callable[..., Any]
-
 WAYS: dict[str, dict[str, Any]] = {
     "sync": {},
     "async": {"use_async_envs": True},

@@ -21,7 +21,6 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 
-
 class Told(gym.Env):
     observation_space = gym.spaces.Box(-1, 1, (2,))
     action_space = gym.spaces.Discrete(3)
@@ -46,11 +45,9 @@ class Told(gym.Env):
     def kept(self, name):
         return cloudpickle.dumps(getattr(self, name))
 
-
 class Own(gym.vector.SyncVectorEnv):
     def again(self, *args, **kwargs):
         return cloudpickle.dumps((args, kwargs))
-
 
 def make_env(n_envs=1, use_async_envs=False, own=False, autoreset_mode="NextStep", **given):
     kind = Own if own else gym.vector.SyncVectorEnv

@@ -33,7 +33,6 @@ import time
 import gymnasium as gym
 import numpy as np
 
-
 class Timed(gym.Env):
     observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
     action_space = gym.spaces.Discrete(2)
@@ -47,7 +46,6 @@ class Timed(gym.Env):
         time.sleep(0.1)
         info = {"span": (begun, time.monotonic())}
         return np.zeros(1, np.float32), float(self.np_random.random()), False, False, info
-
 
 def make_env(n_envs=1, use_async_envs=False, **arguments):
     return gym.vector.AsyncVectorEnv([Timed] * n_envs, **arguments)
@@ -382,7 +380,6 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-
 class Batch(gym.vector.VectorEnv):
     """Steps all at once; what it returns changes its form from step to step."""
 
@@ -436,7 +433,6 @@ class Batch(gym.vector.VectorEnv):
 
     def call(self, name, *args):
         return tuple(getattr(self, name) for _ in range(self.num_envs))
-
 
 def make_env(n_envs=1, use_async_envs=False, mode="NextStep", wide=3, tasks=1):
     return {"suite": {task: Batch(n_envs, mode, wide + task) for task in range(tasks)}}

@@ -30,7 +30,6 @@ MADE = {
     ),
 }
 
-
 class Seeded(gym.Env):
     def __init__(self, kind, seed):
         self.action_space = MADE[kind](seed)
@@ -43,10 +42,8 @@ class Seeded(gym.Env):
     def step(self, action):
         return self.observation_space.sample(), 0.0, False, False, {}
 
-
 class Own(gym.vector.SyncVectorEnv):
     pass
-
 
 def make_env(n_envs=1, use_async_envs=False, kind="discrete", seed=None, own=False):
     made = Own if own else gym.vector.SyncVectorEnv

@@ -22,7 +22,6 @@ from tests.compliance.conftest import pytest_generate_tests
 from tests.containers.kit import IMAGE, Walls
 
 __all__ = ["pytest_generate_tests"]
-
 PLACES = ("strict-jail", "bare-jail", "walls")
 _COLUMNS = ("control, root", *(f"{place}, root" for place in PLACES))
 _HEAD = """# Attacks in containers

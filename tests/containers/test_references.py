@@ -22,9 +22,6 @@ class Reads(Still):
 
     def write(self):
         self.mesh().write_text("changed")
-
-def make_env(n_envs=1, use_async_envs=False):
-    return vector(Reads, n_envs)
 """
 
 

@@ -14,7 +14,6 @@ _BASE = """
 import gymnasium as gym
 import numpy as np
 
-
 class Walk(gym.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
     render_mode = "rgb_array"

@@ -67,7 +67,6 @@ _RESET = "def reset(self, **kwargs):\n    "
 _RESULT = "\n    return super().reset(**kwargs)"
 _STEP = "def step(self, action):\n    "
 _STEPPED = "\n    return super().step(action)"
-
 _OBSERVATIONS = {
     "observation-dtype": {
         "64 bits for 32": _SEEN + "np.array([self.at, self.count])",

@@ -280,7 +280,6 @@ def make_env(n_envs: int = 1, use_async_envs: bool = False, cfg: Config | None =
 
     return gym.vector.SyncVectorEnv([one] * n_envs)
 """
-
 HONEST: dict[str, Entry] = {
     "a walk": _env(),
     "CartPole": _known("CartPole-v1"),

@@ -30,8 +30,6 @@ _ELSEWHERE = {
     "source-uncommitted": "test_survey_checkouts.py",
 }
 """Checks that need more than a folder, and what tests them."""
-
-
 _MOST, _EACH = (len(FAULTS), 1) if "ENVHUB_TEST_LONG" in os.environ else (1, 3)
 
 

@@ -38,9 +38,9 @@ _AGES_S = 60.0
 _tokens = itertools.count(1)
 _OWED = (State.LATE, State.PENDING)
 """A reply may still come: late, or nobody has begun to wait for it."""
-
 delays = st.sampled_from([0.0, 0.0, _SLOW_S])
 waits = st.sampled_from([_AGES_S, _AGES_S, _SOON_S])
+while_open = precondition(lambda self: self.expected is not State.CLOSED)
 
 
 class Attribution(RuleBasedStateMachine):
@@ -54,19 +54,10 @@ class Attribution(RuleBasedStateMachine):
     @initialize()
     def begin(self) -> None:
         """Nothing runs yet, or a remembered manifest would not be one."""
-        self.suites = make_env(
-            sample("echo"),
-            n_envs=2,
-            use_async_envs=True,
-            num_workers=self.shards,
-            policy={
-                "restart": self.restart,
-                "restart_backoff_s": 0,
-                "restart_budget": 10_000,
-                "crash_history": 0,
-                "lane": self.lane,
-            },
-        )
+        policy = {"restart": self.restart, "restart_backoff_s": 0, "restart_budget": 10_000}
+        policy |= {"crash_history": 0, "lane": self.lane}
+        options: Any = {"num_workers": self.shards, "policy": policy}
+        self.suites = make_env(sample("echo"), n_envs=2, use_async_envs=True, **options)
         self.env = self.suites.env
         self.expected = self.state
 
@@ -97,9 +88,11 @@ class Attribution(RuleBasedStateMachine):
         return bool(got[0].tolist() == [[token, 0.0]] * 2)
 
     def is_step(self, got: Any, token: float) -> bool:
-        return _is_step(got, token)
+        observations, rewards, _, _, infos = got
+        same = observations.tolist() == [[token, 1.0]] * 2 and rewards.tolist() == [token] * 2
+        return bool(same and np.array_equal(infos["token"], [token, token]))
 
-    @precondition(lambda self: self.expected is not State.CLOSED)
+    @while_open
     @rule(delay=delays, wait=waits)
     def reset(self, delay: float, wait: float) -> None:
         """A reset brings it back from everywhere, and answers with its own token."""
@@ -113,7 +106,7 @@ class Attribution(RuleBasedStateMachine):
 
         self.after(ask, lambda got: self.is_reset(got, token))
 
-    @precondition(lambda self: self.expected is not State.CLOSED)
+    @while_open
     @rule(delay=delays, wait=waits)
     def step(self, delay: float, wait: float) -> None:
         token = float(next(_tokens))
@@ -124,7 +117,7 @@ class Attribution(RuleBasedStateMachine):
 
         self.after(ask, lambda got: self.is_step(got, token))
 
-    @precondition(lambda self: self.expected is not State.CLOSED)
+    @while_open
     @rule(delay=delays, wait=waits)
     def call(self, delay: float, wait: float) -> None:
         token = float(next(_tokens))
@@ -135,7 +128,7 @@ class Attribution(RuleBasedStateMachine):
 
         self.after(ask, lambda got: got == (token, token))
 
-    @precondition(lambda self: self.expected is not State.CLOSED)
+    @while_open
     @rule(by_step=st.booleans())
     def die(self, by_step: bool) -> None:
         if by_step:
@@ -143,13 +136,13 @@ class Attribution(RuleBasedStateMachine):
         else:
             self.after(lambda: self.env.call("echo", 0.0, -1.0), lambda got: False)
 
-    @precondition(lambda self: self.expected is not State.CLOSED)
+    @while_open
     @rule(grace=st.sampled_from([0.01, 2.0]))
     def patience(self, grace: float) -> None:
         """How long a reset waits for a late reply before it starts afresh."""
         setattr(*inside.LATE_REPLY_GRACE, grace)
 
-    @precondition(lambda self: self.expected is not State.CLOSED)
+    @while_open
     @rule(moment=st.sampled_from([_SOON_S]))
     def interrupt(self, moment: float) -> None:
         """Ctrl-C while a step is sent or waited for, or while the worker starts."""
@@ -174,7 +167,7 @@ class Attribution(RuleBasedStateMachine):
             if came and self.state is State.READY:  # whether it was done, nobody can say
                 self.reset(0.0, _AGES_S)
 
-    @precondition(lambda self: self.expected is not State.CLOSED)
+    @while_open
     @rule(running=st.booleans())
     def close(self, running: bool) -> None:
         """Close from another thread, under a running step or not."""
@@ -221,8 +214,7 @@ class Transparent(Attribution):
 
     def __init__(self) -> None:
         super().__init__()
-        self.lost: set[int] = set()
-        self.over: set[int] = set()
+        self.lost, self.over = set[int](), set[int]()
 
     def is_reset(self, got: Any, token: float) -> bool:
         """All rows are its own; those that came back are marked, in a jail that was not left."""
@@ -245,7 +237,7 @@ class Transparent(Attribution):
             and tokens == [token] * len(own)
         )
 
-    @precondition(lambda self: self.expected is not State.CLOSED)
+    @while_open
     @rule(by_step=st.booleans())
     def die(self, by_step: bool) -> None:
         """The last row's process ends in a step, or all of them in a call."""
@@ -263,12 +255,6 @@ def _restarted(infos: dict[str, Any]) -> set[int]:
     mask = infos.get("worker_restarted", np.zeros(2))
     assert np.array_equal(mask, infos.get("_worker_restarted", np.zeros(2)))
     return set(np.flatnonzero(mask).tolist())
-
-
-def _is_step(got: Any, token: float) -> bool:
-    observations, rewards, _, _, infos = got
-    same = observations.tolist() == [[token, 1.0]] * 2 and rewards.tolist() == [token] * 2
-    return bool(same and np.array_equal(infos["token"], [token, token]))
 
 
 @pytest.fixture

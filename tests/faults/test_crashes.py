@@ -14,6 +14,7 @@ from envhub_sandbox.extras.crash import bundle_writer
 from envhub_sandbox.extras.crash.bundle_reader import load_bundle
 from tests.support.command_line import document, envhub
 from tests.support.processes import eventually
+from tests.support.repositories import write_repository
 from tests.support.samples import sample
 from tests.support.started import started
 
@@ -82,9 +83,9 @@ def test_every_ending_and_action_comes_again(tmp_path: Path, actions: str, endin
         suites.env.reset(seed=11)
         error = play(suites.env)
     found = document("replay", "--grant", str(error.bundle))
-    assert found["verdict"] == "same"
-    assert found["recorded"]["reason"] == error.reason
-    assert error.reason == ("signal" if ending == "segfault" else "out-of-memory")
+    reason = "signal" if ending == "segfault" else "out-of-memory"
+    assert (found["verdict"], found["recorded"]["reason"]) == ("same", error.reason)
+    assert error.reason == reason
 
 
 @pytest.mark.short
@@ -101,8 +102,8 @@ def test_a_bundle_holds_what_is_promised(tmp_path: Path) -> None:
     ]
     document = json.loads((folder / "bundle.json").read_text())
     assert document["provenance"] == json.loads(json.dumps(provenance))
-    assert document["death"]["exit_code"] == 9
-    assert document["death"]["output"] == error.log_tail
+    death = document["death"]
+    assert (death["exit_code"], death["output"]) == (9, error.log_tail)
     assert document["make_env"]["policy"] == {"crash_folder": str(tmp_path)}
     words = (folder / "README.txt").read_text()
     for text in ("envhub replay", "exit code 9", "no luck", "seeds=[4, 5]", "Step(env=0"):
@@ -145,20 +146,18 @@ def test_a_mended_repository_survives(tmp_path: Path) -> None:
 
 
 def test_a_death_in_make_env_is_repeated_too(tmp_path: Path) -> None:
-    kwargs = {"when": "make", "ending": "exit"}
-    policy = {"crash_folder": str(tmp_path)}
+    options: Any = {"env_kwargs": {"when": "make", "ending": "exit"}}
     with pytest.raises(errors.WorkerDiedError) as caught:
-        make_env(sample("exits"), env_kwargs=kwargs, policy=policy)
+        make_env(sample("exits"), policy={"crash_folder": str(tmp_path)}, **options)
     found = document("replay", "--grant", str(caught.value.bundle))
     assert (found["verdict"], found["replayed"]["requests"]) == ("same", 0)
 
 
 def test_a_process_that_was_given_up_leaves_a_bundle(tmp_path: Path) -> None:
     """The reset that gives up on a hanging step raises nothing, and writes down why."""
+    options = {"policy": {"crash_folder": str(tmp_path)}, "timeouts": {"step_s": 0.5}}
     kwargs = {"moment": "step", "fault": "hang"}
-    policy = {"crash_folder": str(tmp_path)}
-    timeouts = {"step_s": 0.5}
-    with started(sample("faulty"), env_kwargs=kwargs, policy=policy, timeouts=timeouts) as env:
+    with started(sample("faulty"), env_kwargs=kwargs, **options) as env:
         with pytest.raises(errors.WorkerTimeoutError):
             env.step([1])
         env.reset(seed=1)
@@ -180,11 +179,9 @@ def test_no_bundle_where_none_is_wanted(tmp_path: Path) -> None:
     with brittle(tmp_path, policy={"crash_history": 0}) as suites:
         suites.env.reset(seed=1)
         error = play(suites.env)
-    assert error.bundle is None
-    assert "envhub replay" not in str(error)
-    suites = brittle(tmp_path)
-    suites.env.reset(seed=1)
-    suites.close()
+    assert (error.bundle, "envhub replay" in str(error)) == (None, False)
+    with brittle(tmp_path) as suites:
+        suites.env.reset(seed=1)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -207,15 +204,12 @@ def test_the_oldest_bundles_give_way(tmp_path: Path, monkeypatch: pytest.MonkeyP
             bundles.append(str(play(suites.env).bundle))
     assert (tmp_path / "mine").is_dir()
     left = {str(path) for path in tmp_path.iterdir()} - {str(tmp_path / "mine")}
-    assert len(left) == 2
-    assert left <= set(bundles)
-    assert bundles[-1] in left
+    assert (len(left), bundles[-1] in left, left <= set(bundles)) == (2, True, True)
 
 
 def test_envhub_run_names_the_bundle() -> None:
     arguments = ("--env-kwargs", "moment=step", "--env-kwargs", "fault=kill", "--episodes", "1")
-    done = envhub("run", sample("faulty"), *arguments, "--steps", "50")
-    assert done.returncode == 5
+    done = envhub("run", sample("faulty"), *arguments, "--steps", "50", code=5)
     output, _, command = done.stderr.partition("To try the same again: envhub replay ")
     assert "about to kill" in output
     assert eventually(lambda: (Path(command.strip()) / "bundle.json").exists())
@@ -232,9 +226,7 @@ def test_a_death_that_is_hidden_leaves_a_bundle_too(
         env = suites.env
         env.action_space.seed(5)
         env.reset(seed=3)
-        for _ in range(2000):
-            if env.sandbox.stats()["restarts"]:
-                break
+        while not env.sandbox.stats()["restarts"]:
             env.step(env.action_space.sample())
         assert env.sandbox.stats()["restarts"] == 1
     [folder] = tmp_path.iterdir()
@@ -250,14 +242,11 @@ def test_a_granted_secret_is_not_in_the_bundle(
     Nor where it has lines, of which each has a margin, or begins with another variable's value."""
     monkeypatch.setenv("SERVICE_KIND", secret[:6])
     monkeypatch.setenv("SERVICE_KEY", secret)
-    (tmp_path / "env").mkdir()
-    (tmp_path / "env" / "env.py").write_text(
-        "import os\nprint('key:', os.environ['SERVICE_KEY'], flush=True)\nos._exit(3)\n"
-    )
-    names = ["SERVICE_KIND", "SERVICE_KEY"]
-    policy = {"environment": names, "crash_folder": str(tmp_path / "crashes")}
+    code = "import os\nprint('key:', os.environ['SERVICE_KEY'], flush=True)\nos._exit(3)\n"
+    granted = ["SERVICE_KIND", "SERVICE_KEY"]
+    policy = {"environment": granted, "crash_folder": str(tmp_path / "crashes")}
     with pytest.raises(errors.WorkerDiedError) as caught:
-        make_env(tmp_path / "env", policy=policy)
+        make_env(write_repository(tmp_path / "env", code), policy=policy)
     assert secret in caught.value.log_tail  # the control: it did print it
     bundle = Path(str(caught.value.bundle))
     files = [path for path in bundle.iterdir() if path.is_file()]

@@ -17,7 +17,6 @@ from tests.support.samples import sample
 
 IDLE_S = 0.5
 WORKING_S = 2.0
-
 pytestmark = pytest.mark.usefixtures("neighbour")
 lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 policies = pytest.mark.parametrize(

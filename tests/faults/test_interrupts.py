@@ -18,7 +18,6 @@ from tests.support.processes import descendants, eventually
 from tests.support.samples import sample
 
 pytestmark = pytest.mark.usefixtures("neighbour")
-
 lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 
 

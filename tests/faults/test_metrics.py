@@ -13,11 +13,11 @@ from envhub_sandbox.session.counters import KEPT, Counters, Labels, Ledger
 from envhub_worker.protocol.lifecycle import Lifecycle
 from tests.support import inside
 from tests.support.processes import halted
+from tests.support.repositories import write_repository
 from tests.support.samples import sample
 from tests.support.started import started
 
 pytestmark = pytest.mark.usefixtures("neighbour")
-
 Key = tuple[str, frozenset[tuple[str, str]]]
 
 
@@ -52,10 +52,7 @@ def key(name: str, **labels: str) -> Key:
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
-    folder = tmp_path / "echo"
-    folder.mkdir()
-    (folder / "env.py").write_text((sample("echo") / "env.py").read_text())
-    return folder
+    return write_repository(tmp_path / "echo", (sample("echo") / "env.py").read_text())
 
 
 @pytest.mark.parametrize("lane", ["auto", "frames"])
@@ -68,20 +65,17 @@ def test_everything_is_exported(registry: Any, repository: Path, lane: str) -> N
             env.step([[1.0, -1.0]])
         env.reset()
         found, told = scraped(registry, label), env.sandbox.stats()
-    assert found[key("envhub_requests_total")] == told["requests"] == 10
-    assert found[key("envhub_steps_total")] == told["steps"] == 7
-    assert found[key("envhub_worker_deaths_total")] == 1
-    assert found[key("envhub_worker_restarts_total")] == 1
-    assert (found[key("envhub_timeouts_total")], found[key("envhub_stale_replies_total")]) == (0, 0)
-    assert found[key("envhub_sent_bytes_total")] == told["sent_bytes"]
-    assert found[key("envhub_received_bytes_total")] == told["received_bytes"]
-    assert found[key("envhub_environments", state="ready")] == 1
-    assert found[key("envhub_step_latency_seconds_count")] == 7
-    latency = told["step_latency_s"]
-    assert found[key("envhub_step_latency_seconds_sum")] == pytest.approx(latency["total"])
+    assert (told["requests"], told["steps"]) == (10, 7)
+    names = ("requests", "steps", "timeouts", "stale_replies", "sent_bytes", "received_bytes")
+    expected = {key(f"envhub_{name}_total"): told[name] for name in names}
+    expected |= {key(f"envhub_worker_{name}_total"): 1 for name in ("deaths", "restarts")}
+    latency, of = told["step_latency_s"], "envhub_step_latency_seconds"
+    expected |= {key(f"{of}_count"): 7, key(f"{of}_sum"): latency["total"]}
     for quantile, name in (("0.5", "p50"), ("0.9", "p90"), ("0.99", "p99")):
-        sample_of = key("envhub_step_latency_seconds", quantile=quantile)
-        assert found[sample_of] == pytest.approx(latency[name])
+        expected[key(of, quantile=quantile)] = latency[name]
+    expected[key("envhub_environments", state="ready")] = 1
+    assert {name: found[name] for name in expected} == pytest.approx(expected)
+    assert (told["timeouts"], told["stale_replies"]) == (0, 0)
 
 
 def test_counts_outlive_their_environments(registry: Any, repository: Path) -> None:
@@ -109,8 +103,7 @@ def test_bytes_are_counted_over_both_lanes(lane: str) -> None:
         for _ in range(10):
             env.step(np.ones((4, 2)) * [1.0, 0.0])
         after = env.sandbox.stats()
-        sent = after["sent_bytes"] - before["sent_bytes"]
-        received = after["received_bytes"] - before["received_bytes"]
+        sent, received = (after[name] - before[name] for name in ("sent_bytes", "received_bytes"))
         assert 10 * 4 * 2 * 8 <= sent <= 10 * (4 * 2 * 8 + 500)
         assert 10 * 4 * (2 * 8 + 10) <= received <= 10 * (4 * (2 * 8 + 10) + 500)
         with pytest.raises(errors.WorkerDiedError):
@@ -176,15 +169,9 @@ def test_counters_follow_what_happens(lane: str, monkeypatch: pytest.MonkeyPatch
         latency = found.pop("step_latency_s")
         assert found.pop("sent_bytes") > 6 * 8
         assert found.pop("received_bytes") > 6 * (8 + 8 + 1 + 1)
-        assert found == {
-            "requests": 3 + 5 + 1 + 1,
-            "steps": 5,
-            "timeouts": 1,
-            "deaths": 1,
-            "restarts": 1,
-            "stale_replies": 0,
-            "state": "READY",
-        }
+        counted = {"requests": 3 + 5 + 1 + 1, "steps": 5, "stale_replies": 0}
+        once = dict.fromkeys(("timeouts", "deaths", "restarts"), 1)
+        assert found == {**counted, **once, "state": "READY"}
         assert latency["total"] >= latency["max"]
         assert 0 < latency["p50"] <= latency["p90"] <= latency["p99"] <= latency["max"]
     assert env.sandbox.stats()["state"] == "CLOSED"
@@ -193,10 +180,8 @@ def test_counters_follow_what_happens(lane: str, monkeypatch: pytest.MonkeyPatch
 def test_latencies_are_those_of_the_last_steps() -> None:
     counters = Counters()
     assert counters.snapshot()["step_latency_s"] == {"total": 0.0}
-    for _ in range(KEPT):
-        counters.stepped(10**9)
-    for _ in range(KEPT):
-        counters.stepped(2 * 10**9)
-    expected = {"p50": 2.0, "p90": 2.0, "p99": 2.0, "max": 2.0, "total": 3.0 * KEPT}
-    assert counters.snapshot()["step_latency_s"] == expected
-    assert counters.snapshot()["steps"] == 2 * KEPT
+    for seconds in [1] * KEPT + [2] * KEPT:
+        counters.stepped(seconds * 10**9)
+    expected = {**dict.fromkeys(("p50", "p90", "p99", "max"), 2.0), "total": 3.0 * KEPT}
+    told = counters.snapshot()
+    assert (told["step_latency_s"], told["steps"]) == (expected, 2 * KEPT)

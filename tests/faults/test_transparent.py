@@ -26,7 +26,6 @@ from tests.support.samples import reference, sample
 POLICY = {"restart": "transparent", "restart_backoff_s": 0, "crash_history": 0}
 LAST_DIES = [LIVE, LIVE, LIVE, EXIT]
 DEAD, ALL = slice(2, 4), slice(4)
-
 pytestmark = pytest.mark.usefixtures("neighbour")
 
 

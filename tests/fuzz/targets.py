@@ -530,5 +530,4 @@ TARGETS: dict[str, Callable[[Dice], None]] = {
         warnings, server, tracebacks, stream, packed, column_schemas,
     )
 }  # fmt: skip
-
 __all__ = ["TARGETS", "Dice", "NotSentError", "WrongError"]

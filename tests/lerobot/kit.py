@@ -21,7 +21,6 @@ OWN = "ENVHUB_TEST_LEROBOT_PYTHON"
 """An interpreter that has all of LeRobot: ``python -m tests.lerobot`` makes it."""
 THEIRS = "ENVHUB_TEST_LEROBOT_SOURCE"
 """A folder with LeRobot's repository at that version, if there is one."""
-
 READ_AS = {
     "org/policy": "robots/policy",
     "org/dataset": "robots/recorded",

@@ -10,7 +10,6 @@ import numpy as np
 
 os.environ["REACHED"] = "whoever executed this file"
 
-
 class Reach(gym.Env):
     """A point that is to come to a goal: what a LeRobot policy looks for in an environment."""
 
@@ -52,7 +51,6 @@ class Reach(gym.Env):
         frame[x, y] = 255
         return frame
 
-
 def make_env(n_envs=1, use_async_envs=False, cfg=None):
     vector = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
     return vector([Reach] * n_envs)
@@ -65,7 +63,6 @@ COUNTING = REACH.replace(
     "        self.goal += self.resets\n        self.steps = 0\n",
 )
 assert COUNTING != REACH
-
 SUITES = """
 import gymnasium as gym
 from reach import Reach
@@ -75,14 +72,12 @@ def make_env(n_envs=1, use_async_envs=False):
     made = lambda task: vector([lambda: Reach(task)] * n_envs)
     return {"near": {0: made("touch"), 1: made("push")}, "far": {0: made("throw")}}
 """
-
 SINGLE = """
 from reach import Reach
 
 def make_env(n_envs=1, use_async_envs=False):
     return Reach()
 """
-
 CONFIGURED = """
 import gymnasium as gym
 from reach import Reach
@@ -90,7 +85,6 @@ from reach import Reach
 def make_env(n_envs=1, use_async_envs=False, cfg=None):
     return gym.vector.SyncVectorEnv([lambda: Reach(cfg.environment)] * n_envs)
 """
-
 CARTPOLE = """
 import gymnasium as gym
 
@@ -98,11 +92,9 @@ def make_env(n_envs=1, use_async_envs=False):
     vector = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
     return vector([lambda: gym.make("CartPole-v1")] * n_envs)
 """
-
 PENDULUM = '''
 import gymnasium as gym
 import numpy as np
-
 
 class AsRobot(gym.ObservationWrapper):
     """Pendulum, whose observation LeRobot takes for a robot's joints."""
@@ -114,13 +106,11 @@ class AsRobot(gym.ObservationWrapper):
     def observation(self, observation):
         return {"agent_pos": observation.astype(np.float32)}
 
-
 def make_env(n_envs=1, use_async_envs=False):
     vector = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
     make = lambda: AsRobot(gym.make("Pendulum-v1", max_episode_steps=5, render_mode="rgb_array"))
     return vector([make] * n_envs)
 '''
-
 CAMERAS = """
 import gymnasium as gym
 import numpy as np
@@ -138,7 +128,6 @@ class Seen(gym.Env):
 def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.SyncVectorEnv([Seen] * n_envs)
 """
-
 LIBERO = """
 import gymnasium as gym
 import numpy as np
@@ -167,7 +156,6 @@ class Kitchen(gym.Env):
 def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.SyncVectorEnv([Kitchen] * n_envs)
 """
-
 DECLARED = LIBERO.replace(
     '{"render_fps": 80}',
     """{"render_fps": 80, "env_preprocessor": {"steps": [
@@ -176,7 +164,6 @@ DECLARED = LIBERO.replace(
          "config": {"rename_map": {"observation.images.image2": "observation.images.wrist"}}},
     ]}}""",
 )
-
 ARENA = """
 import gymnasium as gym
 import torch

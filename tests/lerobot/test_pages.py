@@ -10,7 +10,6 @@ from tests.lerobot.kit import run, written
 from tests.lerobot.repositories import COUNTING, publish
 
 pytest.importorskip("torch")
-
 ONE = {"hub_env": [0]}
 EXPECTED = {
     # the control: without install() LeRobot refuses, and runs the code in its own process
@@ -63,8 +62,6 @@ FEATURES = {
     "observation.images.top": ["VISUAL", 3, 24, 32],
     "observation.images.wrist": ["VISUAL", 3, 24, 32],
 }
-
-
 POLICY = '{"type": "act"}'
 
 

@@ -25,7 +25,6 @@ def played(sandboxed: bool) -> list[Any]:
     name = "sandboxed" if sandboxed else "here"
     config = AttrDict(env=name, env_gpu_observations=False, with_wandb=False)
     env = make_env_func_batched(config, AttrDict(worker_index=0, vector_index=0, env_id=0))
-
     drawn = np.random.default_rng(0)
     seen = [{key: one.numpy().copy() for key, one in env.reset(seed=1)[0].items()}]
     for _ in range(STEPS):

@@ -1,14 +1,20 @@
-"""Whatever a client asks, it is answered, and others go on: also what breaks every rule."""
+"""What a server answers to requests that are wrong, and to another version."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import msgpack
 import pytest
 
+from envhub_sandbox.errors import VersionMismatchError
+from envhub_sandbox.sandboxes.process import PROCESS
+from envhub_sandbox.transport.connection import WorkerConnection
+from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.extras.access import keys
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from tests.attacks.client.lying_server import lying
 from tests.remote.listening import Listening
 from tests.remote.peers import Peer, peer
 
@@ -84,3 +90,33 @@ def test_many_in_a_row_do_not_end_the_server(client: Peer, good: Any, server: Li
     assert isinstance(client.ask(m.GetStatus()), (m.Status, m.Refusal))
     assert server.process.poll() is None
     assert "Traceback" not in server.said()
+
+
+ANOTHER = m.VERSION + 1
+
+
+@pytest.mark.parametrize("version", [ANOTHER, 0])
+def test_a_server_refuses_a_client_of_another_version(tmp_path: Path, version: int) -> None:
+    use = PROCESS.acquire(tmp_path)
+    server = use.server
+    client = WorkerConnection(server.endpoint, server.process_fd)
+    try:
+        reply, _ = client.request(m.Hello(version, b"x"), deadline=Deadline(60))
+    finally:
+        client.close()
+        use.release()
+    assert isinstance(reply, m.Refusal)
+    assert reply.error == "VersionMismatchError"
+    assert f"protocol {version}, this worker {m.VERSION}" in reply.message
+
+
+def test_a_client_refuses_a_worker_of_another_version() -> None:
+    with lying() as server:
+        server.lies[m.Hello] = lambda asked: [asked.answer(m.Welcome(ANOTHER, "9.9.9", 4242))]
+        client = WorkerConnection(server.endpoint, server.process_fd)
+        try:
+            text = f"protocol {m.VERSION}, the worker {ANOTHER}: install the same release"
+            with pytest.raises(VersionMismatchError, match=text):
+                client.hello(Deadline(60))
+        finally:
+            client.close()

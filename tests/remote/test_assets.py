@@ -18,9 +18,6 @@ class Reads(Still):
 
     def write(self):
         Path(hf_hub_download("org/data", "mesh.txt", repo_type="dataset")).write_text("changed")
-
-def make_env(n_envs=1, use_async_envs=False):
-    return vector(Reads, n_envs)
 """
 
 

@@ -14,7 +14,6 @@ from tests.remote.listening import Listening
 from tests.remote.relay import relay
 
 lz4 = pytest.importorskip("lz4.block", reason="needs lz4: pip install lz4")
-
 LIMITS = WireLimits(frame_bytes=1 << 20, message_bytes=2 << 20)
 SMOOTH = bytes(1 << 18)
 NOISE = np.random.default_rng(0).bytes(1 << 18)

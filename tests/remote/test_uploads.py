@@ -4,6 +4,7 @@ import errno
 import hashlib
 import os
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -26,25 +27,30 @@ OWNER = ALICE + b"session"
 SIX = 6 * BLOCK_BYTES
 
 
+def sha256(data: bytes) -> bytes:
+    return hashlib.sha256(data).digest()
+
+
 def offer(*files: tuple[str, bytes]) -> m.OfferSnapshot:
-    return m.OfferSnapshot(
-        tuple((name, len(data), hashlib.sha256(data).digest()) for name, data in files)
-    )
+    return m.OfferSnapshot(tuple((name, len(data), sha256(data)) for name, data in files))
+
+
+def refused(match: str) -> Any:
+    return pytest.raises(RefusedError, match=match)
 
 
 def put(uploads: Uploads, data: bytes, *, key: bytes = ALICE, told: bytes | None = None) -> None:
     """Bring one file, in pieces of four bytes."""
-    sha256 = hashlib.sha256(data if told is None else told).digest()
-    for offset in range(0, max(1, len(data)), 4):
-        piece = data[offset : offset + 4]
-        uploads.put(key + b"session", key, m.PutBlob(sha256, offset), piece)
+    name = sha256(data if told is None else told)
+    for at in range(0, max(1, len(data)), 4):
+        uploads.put(key + b"session", key, m.PutBlob(name, at), data[at : at + 4])
 
 
 def bring(uploads: Uploads, *files: tuple[str, bytes], key: bytes = ALICE) -> str:
     """Bring a whole snapshot; returns its name."""
     wanted = uploads.offer(key + b"session", key, offer(*files), ())
     for _, data in files:
-        if hashlib.sha256(data).digest() in wanted.hashes:
+        if sha256(data) in wanted.hashes:
             put(uploads, data, key=key)
     wanted = uploads.offer(key + b"session", key, offer(*files), ())
     assert wanted.hashes == ()
@@ -78,7 +84,7 @@ def test_a_snapshot_is_a_real_read_only_tree(uploads: Uploads) -> None:
 def test_bytes_with_another_hash_are_refused(uploads: Uploads) -> None:
     asked = offer(("env.py", b"honest"))
     uploads.offer(OWNER, ALICE, asked, ())
-    with pytest.raises(RefusedError, match="another hash"):
+    with refused("another hash"):
         put(uploads, b"forged", told=b"honest")
     assert uploads.offer(OWNER, ALICE, asked, ()).hashes
     assert brought(uploads) == 0
@@ -86,43 +92,40 @@ def test_bytes_with_another_hash_are_refused(uploads: Uploads) -> None:
 
 def test_what_was_not_asked_for_is_refused(uploads: Uploads) -> None:
     """Not asked for, out of order, longer than it was said to be, or than one piece may be."""
-    with pytest.raises(RefusedError, match="not asked for"):
+    with refused("not asked for"):
         put(uploads, b"unasked")
     uploads.offer(OWNER, ALICE, offer(("a", b"12345678")), ())
-    sha256 = hashlib.sha256(b"12345678").digest()
-    with pytest.raises(RefusedError, match="out of order"):
-        uploads.put(OWNER, ALICE, m.PutBlob(sha256, 4), b"5678")
-    with pytest.raises(RefusedError, match="larger"):
-        uploads.put(OWNER, ALICE, m.PutBlob(sha256, 0), b"123456789")
-    with pytest.raises(RefusedError, match="too large"):
-        uploads.put(OWNER, ALICE, m.PutBlob(sha256, 0), bytes(MAX_PIECE_BYTES + 1))
+    for why, at, piece in (
+        *(("out of order", 4, b"5678"), ("larger", 0, b"123456789")),
+        ("too large", 0, bytes(MAX_PIECE_BYTES + 1)),
+    ):
+        with refused(why):
+            uploads.put(OWNER, ALICE, m.PutBlob(sha256(b"12345678"), at), piece)
 
 
 def test_few_files_are_begun_at_once(uploads: Uploads, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each that is begun is a file on disk and a running hash."""
     monkeypatch.setattr(f"{Uploads.__module__}.MAX_PARTIAL", 1)
     uploads.offer(OWNER, ALICE, offer(("a", b"12345"), ("b", b"54321")), ())
-    first, second = (m.PutBlob(hashlib.sha256(data).digest(), 0) for data in (b"12345", b"54321"))
-    uploads.put(OWNER, ALICE, first, b"1234")
-    with pytest.raises(RefusedError, match="on their way already"):
-        uploads.put(OWNER, ALICE, second, b"5432")
+    uploads.put(OWNER, ALICE, m.PutBlob(sha256(b"12345"), 0), b"1234")
+    with refused("on their way already"):
+        uploads.put(OWNER, ALICE, m.PutBlob(sha256(b"54321"), 0), b"5432")
 
 
 def test_another_clients_files_cannot_be_had_by_their_hash(uploads: Uploads) -> None:
     """Whoever knows the hash of a file still has to bring the file."""
     name = bring(uploads, ("secret", b"of alice"))
-    with pytest.raises(RefusedError, match="no such snapshot"):
+    with refused("no such snapshot"):
         uploads.tree(BOB, name)
     asked = offer(("secret", b"of alice"))
     assert uploads.offer(BOB + b"session", BOB, asked, ()).hashes
     again = Uploads(uploads.folder, Quotas())  # after a restart the store is found again
-    assert Path(again.tree(ALICE, name)).is_dir()
-    assert name.startswith(PREFIX)
+    assert (Path(again.tree(ALICE, name)).is_dir(), name.startswith(PREFIX)) == (True, True)
 
 
 @pytest.mark.parametrize("name", ["/etc", "sha256:../../etc", "sha256:", "sha256:" + "0" * 64])
 def test_a_snapshot_is_no_path(uploads: Uploads, name: str) -> None:
-    with pytest.raises(RefusedError, match="no such snapshot"):
+    with refused("no such snapshot"):
         uploads.tree(ALICE, name)
 
 
@@ -130,7 +133,7 @@ def test_the_longest_unused_make_room_and_those_in_use_stay(uploads: Uploads) ->
     """A quota is of what lies there; what a jail runs is never removed under it."""
     first = uploads.tree(ALICE, bring(uploads, ("env.py", b"1" * SIX)))
     os.utime(first, (1, 1))
-    with pytest.raises(RefusedError, match="--max-upload"):
+    with refused("--max-upload"):
         uploads.offer(OWNER, ALICE, offer(("env.py", b"2" * SIX)), {first})
     assert uploads.used_bytes(ALICE) == SIX + BLOCK_BYTES  # nothing is kept for what was refused
     bring(uploads, ("env.py", b"2" * SIX))
@@ -140,9 +143,8 @@ def test_the_longest_unused_make_room_and_those_in_use_stay(uploads: Uploads) ->
 
 def test_what_a_client_had_begun_goes_with_it(uploads: Uploads) -> None:
     uploads.offer(OWNER, ALICE, offer(("a", b"12345678")), ())
-    uploads.put(OWNER, ALICE, m.PutBlob(hashlib.sha256(b"12345678").digest(), 0), b"1234")
-    assert brought(uploads) == 4
-    assert uploads.used_bytes(ALICE) == 2 * BLOCK_BYTES
+    uploads.put(OWNER, ALICE, m.PutBlob(sha256(b"12345678"), 0), b"1234")
+    assert (brought(uploads), uploads.used_bytes(ALICE)) == (4, 2 * BLOCK_BYTES)
     uploads.forget(OWNER)
     assert brought(uploads) == uploads.used_bytes(ALICE) == 0
 
@@ -153,7 +155,7 @@ def test_an_upload_that_begins_again_is_not_refused_for_its_own_bytes(uploads: U
         data = content * SIX
         uploads.offer(OWNER, ALICE, offer(("a", data)), ())
         assert brought(uploads) == 0
-        uploads.put(OWNER, ALICE, m.PutBlob(hashlib.sha256(data).digest(), 0), data[:-1])
+        uploads.put(OWNER, ALICE, m.PutBlob(sha256(data), 0), data[:-1])
         assert uploads.used_bytes(ALICE) == SIX + BLOCK_BYTES
     bring(uploads, ("a", data))
     assert uploads.used_bytes(ALICE) == SIX + BLOCK_BYTES
@@ -164,10 +166,10 @@ def test_what_another_session_still_expects_is_not_removed(uploads: Uploads) -> 
     other = ALICE + b"other"
     old = uploads.tree(ALICE, bring(uploads, ("old", b"0" * BLOCK_BYTES)))
     wanted = uploads.offer(other, ALICE, offer(("one", b"1"), ("two", b"2")), ())
-    uploads.put(other, ALICE, m.PutBlob(hashlib.sha256(b"1").digest(), 0), b"1")
+    uploads.put(other, ALICE, m.PutBlob(sha256(b"1"), 0), b"1")
     uploads.offer(OWNER, ALICE, offer(("env.py", b"3" * (SIX - BLOCK_BYTES))), ())
     assert not Path(old).exists()
-    uploads.put(other, ALICE, m.PutBlob(hashlib.sha256(b"2").digest(), 0), b"2")
+    uploads.put(other, ALICE, m.PutBlob(sha256(b"2"), 0), b"2")
     whole = uploads.offer(other, ALICE, offer(("one", b"1"), ("two", b"2")), ())
     assert (whole.snapshot, whole.hashes) == (wanted.snapshot, ())
 
@@ -175,7 +177,7 @@ def test_what_another_session_still_expects_is_not_removed(uploads: Uploads) -> 
 def test_many_sessions_of_a_key_share_its_quota(uploads: Uploads) -> None:
     uploads.offer(ALICE + b"1", ALICE, offer(("a", b"1" * SIX)), ())
     uploads.offer(BOB + b"1", BOB, offer(("a", b"1" * SIX)), ())
-    with pytest.raises(RefusedError, match="--max-upload"):
+    with refused("--max-upload"):
         uploads.offer(ALICE + b"2", ALICE, offer(("a", b"2" * SIX)), ())
     uploads.forget(ALICE + b"1")
     uploads.offer(ALICE + b"2", ALICE, offer(("a", b"2" * SIX)), ())
@@ -185,17 +187,16 @@ def test_small_files_and_folders_are_charged_what_they_take(uploads: Uploads) ->
     name = bring(uploads, ("a/b/c", b"1"), ("a/b/d", b"1"), ("a/e", b""))
     assert uploads.used_bytes(ALICE) == (2 + 5) * BLOCK_BYTES
     assert Uploads(uploads.folder, Quotas()).used_bytes(ALICE) == (2 + 5) * BLOCK_BYTES
-    with pytest.raises(RefusedError, match="--max-upload"):
-        uploads.offer(
-            OWNER, ALICE, offer(("/".join("abcdefghij"), b"1")), {uploads.tree(ALICE, name)}
-        )
+    with refused("--max-upload"):
+        deep = offer(("/".join("abcdefghij"), b"1"))
+        uploads.offer(OWNER, ALICE, deep, {uploads.tree(ALICE, name)})
 
 
 def test_copies_are_charged(uploads: Uploads, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file system may have no more links: then the same file over and over is no bargain."""
     files = [(name, b"1" * 2 * BLOCK_BYTES) for name in "abcd"]
-    monkeypatch.setattr("os.link", _no_links)
-    with pytest.raises(RefusedError, match="--max-upload"):
+    monkeypatch.setattr("os.link", Mock(side_effect=OSError(errno.EMLINK, "too many links")))
+    with refused("--max-upload"):
         bring(uploads, *files)
     assert brought(uploads) == 2 * BLOCK_BYTES
     tree = Path(uploads.tree(ALICE, bring(uploads, *files[:2])))
@@ -211,18 +212,12 @@ def test_a_program_is_a_copy_that_may_be_run(uploads: Uploads) -> None:
     row = (*offer(("run.sh", b"x")).files[0], True)
     found = uploads.offer(OWNER, ALICE, m.OfferSnapshot((row,)), ())
     assert (found.hashes, found.snapshot != plain) == ((), True)
-    modes = [
-        Path(uploads.tree(ALICE, name), "run.sh").stat().st_mode for name in (plain, found.snapshot)
-    ]
-    assert [mode & 0o777 for mode in modes] == [0o444, 0o555]
+    trees = [Path(uploads.tree(ALICE, name)) for name in (plain, found.snapshot)]
+    assert [(tree / "run.sh").stat().st_mode & 0o777 for tree in trees] == [0o444, 0o555]
     assert uploads.used_bytes(ALICE) - before > BLOCK_BYTES
     for wrong in (False, 1, "True", (True, True)):
-        with pytest.raises(RefusedError, match=r"a file is \(path, size, sha256\[, True\]\)"):
+        with refused(r"a file is \(path, size, sha256\[, True\]\)"):
             uploads.offer(OWNER, ALICE, m.OfferSnapshot(((*row[:3], wrong),)), ())
-
-
-def _no_links(*_: object) -> None:
-    raise OSError(errno.EMLINK, "too many links")
 
 
 def test_snapshots_and_folders_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -230,14 +225,14 @@ def test_snapshots_and_folders_are_counted(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr("envhub_worker.extras.access.store.uploads.MAX_TREES", 2)
     uploads = Uploads(tmp_path / "store", Quotas())
     first, second = (uploads.tree(ALICE, bring(uploads, (name, b""))) for name in "ab")
-    with pytest.raises(RefusedError, match="more than 2"):
+    with refused("more than 2"):
         uploads.offer(OWNER, ALICE, offer(("c", b"")), {first, second})
     os.utime(first, (1, 1))
     bring(uploads, ("c", b""))
     assert (Path(first).exists(), Path(second).exists()) == (False, True)
     deep = "/".join(["x"] * 60)
     files = tuple((f"{number}/{deep}", 0, bytes(32)) for number in range(4000))
-    with pytest.raises(RefusedError, match="steps"):
+    with refused("steps"):
         uploads.offer(OWNER, ALICE, m.OfferSnapshot(files), ())
 
 
@@ -287,8 +282,6 @@ def test_only_the_edited_file_travels_to_a_real_server(server: Listening, tmp_pa
         client.hello(Deadline(60))
         (repository / "empty").write_bytes(b"no more")
         files = remote_repository.listing(repository)
-        assert remote_repository.upload(client, repository, files, Deadline(60))[1] == len(
-            b"no more"
-        )
-        assert remote_repository.upload(client, repository, files, Deadline(60))[1] == 0
+        for bytes_ in (len(b"no more"), 0):
+            assert remote_repository.upload(client, repository, files, Deadline(60))[1] == bytes_
         client.close()

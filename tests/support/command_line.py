@@ -33,23 +33,26 @@ def python(
     return done
 
 
-def envhub(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
+def envhub(
+    *arguments: str | Path, code: int | None = None, **variables: str
+) -> subprocess.CompletedProcess[str]:
     """Run the command line to its end, in this process, whose worker servers it uses."""
     done = CliRunner().invoke(app, [*map(str, arguments)], env=variables, prog_name="envhub")
+    assert code is None or done.exit_code == code, done.output
     return subprocess.CompletedProcess(arguments, done.exit_code, done.stdout, done.stderr)
 
 
-def program(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
+def program(
+    *arguments: str | Path, code: int | None = None, **variables: str
+) -> subprocess.CompletedProcess[str]:
     """The same in a process of its own, where its streams and what it imports matter."""
     variables = {"PYTHONIOENCODING": "utf-8", **variables}
-    return python(*COMMAND[1:], *arguments, code=None, **variables)
+    return python(*COMMAND[1:], *arguments, code=code, **variables)
 
 
 def document(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
     """The document of ``--json``, which is all that is on stdout."""
-    done = envhub(*arguments, "--json")
-    assert done.returncode == code, done.stderr
-    return json.loads(done.stdout, parse_constant=pytest.fail)
+    return json.loads(envhub(*arguments, "--json", code=code).stdout, parse_constant=pytest.fail)
 
 
 def below(pid: int) -> list[psutil.Process]:

@@ -31,10 +31,10 @@ def vector(kind, n_envs):
     return gym.vector.SyncVectorEnv([kind] * n_envs)
 
 def make_env(n_envs=1, use_async_envs=False):
-    return vector(Still, n_envs)
+    return vector([Still, *Still.__subclasses__()][-1], n_envs)
 
 """
-"""An environment in which nothing happens; what follows may inherit from it and be made instead."""
+"""An environment in which nothing happens; the last class that inherits from it is made instead."""
 
 
 def importing(module: str, **answers: str) -> str:

@@ -37,7 +37,6 @@ Frames = list[Buffer]
 NUM_ENVS = 2
 OBSERVATION = spaces.Box(-1, 1, (3,), np.float32)
 ACTION = spaces.Discrete(2)
-
 Lie = Callable[["Asked"], list[Frames]]
 """All the messages that go out instead of the honest one."""
 

@@ -45,9 +45,6 @@ class Reads(Still):
     def found(self):
         hub = os.environ["HF_HOME"] + "/hub"
         return sorted(os.listdir(hub)) if os.path.isdir(hub) else []
-
-def make_env(n_envs=1, use_async_envs=False):
-    return vector(Reads, n_envs)
 """
 Make = Callable[..., Any]
 

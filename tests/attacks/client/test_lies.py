@@ -269,7 +269,6 @@ DISAGREEING: dict[str, dict[str, Any]] = {
 def test_contradictory_manifest_does_no_harm(liar: LyingServer, folder: str, what: str) -> None:
     """Single and batched spaces that do not belong together: an error, or what one has."""
     liar.lies[m.Load] = relayed(described(changed(**DISAGREEING[what])))
-
     with contextlib.suppress(EnvHubError), opened(liar, folder) as suites:
         observation, _ = suites.env.reset()
         # what was declared for one sub-environment decides; the rest is for the caller to read

@@ -39,7 +39,6 @@ from tests.support.objects.curious import do, names_asked_for
 from tests.support.repositories import write_repository
 
 FAMILY = "The client, by what libraries do with any object"
-
 TOKEN = "hf_canary_of_the_caller_0123456789"
 HTML, ENSURE = "_repr_html_", "_ensure"
 ASKED = {

@@ -217,7 +217,6 @@ def test_names_of_suites_write_nothing_elsewhere(
     value["envs"][0]["suite"] = suite
     liar.lies[m.Load] = relayed(m.LoadDone(value))
     assert isinstance(refuses(lambda: opened(liar, folder)), RemoteProtocolError)
-
     results = tmp_path / "results" / "videos"
     results.mkdir(parents=True)
     write_videos(results, [(suite, 0)])

@@ -50,9 +50,6 @@ class Looks(Still):
         modules += [tried(lambda: [one.name for one in pkgutil.iter_modules([str(HERE)])])]
         return [read, found, modules, glob.glob(str(HERE / "**"), recursive=True), repr(linked),
                 tried(os.listdir, HERE)]
-
-def make_env(n_envs=1, use_async_envs=False):
-    return vector(Looks, n_envs)
 """
 PLANTED: dict[str, Callable[[Path], object]] = {
     "": lambda folder: None,

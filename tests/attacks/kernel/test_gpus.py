@@ -15,7 +15,6 @@ from tests.attacks.harness import ANSWER, Arena, token
 from tests.attacks.kernel import gpu_host
 
 FAMILY = "GPUs"
-
 GRANTED = ("/dev/nvidia0", "/dev/nvidiactl", "/dev/nvidia-uvm", "/dev/dri/renderD128", "/dev/kfd")
 OTHERS = ("/dev/nvidia1", "/dev/dri/renderD129")
 UNNEEDED = ("/dev/nvidia-modeset", "/dev/nvidia-uvm-tools", "/dev/dri/card0", "/dev/sda")

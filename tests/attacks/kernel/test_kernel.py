@@ -22,7 +22,6 @@ from tests.attacks.harness import (
 from tests.support.processes import eventually
 
 FAMILY = "The kernel"
-
 Look = Callable[[int, int], object]
 
 

@@ -16,7 +16,6 @@ from tests.attacks.harness import ANSWER, HOSTILE, Arena, control_run, token
 FAMILY = "GPUs"
 GRANTED = gpu_devices(real_host())
 _NAMES = ("nvidia*", "nvidia-caps*/*", "dri/*", "kfd")
-
 pytestmark = pytest.mark.skipif(not GRANTED, reason="no GPU here, or no driver for it")
 nvidias = pytest.mark.skipif("/dev/nvidia0" not in GRANTED, reason="no GPU of NVIDIA's here")
 

@@ -36,9 +36,6 @@ class Windows(Still):
     def variables(self):
         names = ("DISPLAY", "SDL_VIDEODRIVER", "PYOPENGL_PLATFORM", "XAUTHORITY")
         return {{name: os.environ.get(name) for name in names}}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return vector(Windows, n_envs)
 """
 
 

@@ -25,7 +25,6 @@ from tests.attacks.network.listeners import (
 )
 
 FAMILY = "Network"
-
 _LOCAL = {"family": socket.AF_UNIX, "kind": socket.SOCK_STREAM}
 
 

@@ -26,7 +26,6 @@ from tests.attacks.network.listeners import (
 )
 
 FAMILY = "Network"
-
 _TCP_FASTOPEN = (socket.IPPROTO_TCP, 23, 16)
 WAYS: dict[str, tuple[str, dict[str, Any]]] = {
     "TCP": ("tcp", TCP),

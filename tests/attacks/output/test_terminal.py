@@ -20,7 +20,6 @@ from tests.attacks.output.painting import ESCAPES, paints
 from tests.attacks.repositories import write_environment
 
 FAMILY = "The terminal"
-
 _CLIENT = """
 import json, os, sys
 sys.path.insert(0, sys.argv[2])

@@ -74,7 +74,6 @@ def test_a_flood_of_warnings_is_small_plain_and_ours(home: Path, lane: str) -> N
     assert paints(control[0].category.__name__)
     assert max(len(str(one.message)) for one in control) > GIANT
     assert {one.filename for one in control} == {"/etc/passwd"}
-
     told = told_by(lambda: make_env(str(folder), policy={"lane": lane}).env)
     assert 0 < len(told) <= MOST + 1
     assert {one.category for one in told} == {RemoteEnvWarning}

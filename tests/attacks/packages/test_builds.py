@@ -21,7 +21,6 @@ from tests.support.processes import eventually
 
 FAMILY = "Sources that are built"
 _CONTROL_S = 120.0
-
 ATTACK = """
 def attempt(work):
     try:

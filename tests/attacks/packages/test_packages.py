@@ -17,7 +17,6 @@ from tests.support.packages.environments import base_interpreter, install, runni
 from tests.support.repositories import write_repository
 
 FAMILY = "Packages of the repository's own"
-
 REPOSITORY = """
 import os, sys
 import gymnasium as gym

@@ -25,7 +25,6 @@ from tests.support.processes import eventually
 FAMILY = "Outliving the environment"
 _PATIENCE_S = 60.0
 """Far less than what is left behind lives by itself."""
-
 _CLIENT = """
 import json, sys, time
 from envhub_sandbox import make_env

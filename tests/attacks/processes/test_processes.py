@@ -15,7 +15,6 @@ from tests.attacks.processes.victim import SIGNALS, WORD
 from tests.support.processes import may_change_niceness, other_niceness
 
 FAMILY = "Other processes"
-
 _IDLE_CLASS = 3 << 13
 _ONE_CORE = {min(os.sched_getaffinity(0))}
 _NICE = other_niceness()

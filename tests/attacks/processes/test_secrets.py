@@ -14,7 +14,6 @@ from tests.attacks.processes.victim import victim
 from tests.support.processes import unless_ended
 
 FAMILY = "Secrets in memory, environments and keyrings"
-
 _ADD_USER_KEYRING, _INVALIDATE = -4, 21
 
 

@@ -17,7 +17,6 @@ from tests.attacks.harness import Arena, Run, call, control_run, run_in
 from tests.support.processes import eventually
 
 pytestmark = pytest.mark.short
-
 FAMILY = "Our own processes"
 
 

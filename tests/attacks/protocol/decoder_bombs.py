@@ -25,7 +25,6 @@ FULL = 8 * MIB - 64
 ITEMS = 199_000
 ADDRESS_SPACE = 512 * MIB
 CPU_S = 60
-
 Frames = list[Buffer]
 
 
@@ -117,7 +116,6 @@ REFUSED: dict[str, Callable[[], Frames]] = {
     ),
     "pickles": lambda: many(extension(5, b"x" * 30), ITEMS),
 }  # fmt: skip
-
 ACCEPTED: dict[str, Callable[[], Frames]] = {
     "as many empty maps as may be": lambda: many(b"\x80", ITEMS),
     "as many empty sets as may be": lambda: many(b"\x91\xc7\x00\x11", ITEMS // 2),
@@ -138,7 +136,6 @@ ACCEPTED: dict[str, Callable[[], Frames]] = {
     ),
     "collisions in small maps": colliding_in_small_maps,
 }  # fmt: skip
-
 BOMBS = REFUSED | ACCEPTED
 
 

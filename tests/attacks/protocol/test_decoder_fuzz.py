@@ -37,7 +37,6 @@ from tests.support.wire import decode_space, ext, message, packed
 ROOT = Path(__file__).parents[3]
 FUZZ = settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 PEAK_BYTES = 64 * MIB
-
 SAMPLE: list[Any] = [
     "step", 17, {"a": 1.5, 2: (None, True), (3, "x"): b"bytes"}, {1, 2}, frozenset(["y"]),
     range(3), slice(1, None), 2**80, 1 + 2j, np.float32(2.5), np.bool_(True), np.str_("text"),

@@ -25,7 +25,6 @@ from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.shared_memory.packets import packet_bytes, write_packet
 
 pytestmark = pytest.mark.short
-
 WAIT_S = 60
 SLOT = 1 << 16
 

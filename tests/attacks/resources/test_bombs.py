@@ -34,7 +34,6 @@ from tests.support.processes import eventually, most_grown, resident
 from tests.support.turns import LONGEST_S, turn
 
 FAMILY = "Bombs"
-
 MIB = 1 << 20
 MEMORY, BOMB = 128 * MIB, 224 * MIB
 SMALL, SMALL_BOMB = 72 * MIB, 120 * MIB

@@ -19,7 +19,6 @@ from tests.attacks.harness import ANSWER, USER, Arena, Run, token
 from tests.support.turns import LONGEST_S, turn
 
 FAMILY = "What others share"
-
 MIB = 1 << 20
 
 

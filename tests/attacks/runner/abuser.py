@@ -15,7 +15,6 @@ from tests.attacks.repositories import write_environment
 
 WATCHDOG_S = 240
 """Far more than all timeouts of the client together."""
-
 ABUSE = """
 import contextlib, os, resource, socket, stat, threading
 

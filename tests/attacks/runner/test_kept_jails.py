@@ -19,7 +19,6 @@ from tests.support.processes import eventually
 
 FAMILY = "The client, from inside a jail"
 FORGED = 666.0
-
 _ENV = """
 import ctypes, os, stat, tempfile, time
 from pathlib import Path

@@ -26,7 +26,6 @@ from tests.attacks.runner.test_doorbells import ACTS
 from tests.support import inside
 
 FAMILY = "The client, from inside a jail"
-
 STEPS = 30
 _PATIENCE_S = 240.0
 """A jail that hammers leaves little of a busy machine to who answers it."""

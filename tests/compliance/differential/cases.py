@@ -56,10 +56,9 @@ def case(number: int) -> Case:
     is_async = draw.random() < 0.5 and "env_kwargs" not in options
     mode = draw.choice(list(AutoresetMode))
     observing = "same" if loose else draw.choice(["same", "same", "different"])
-    if observing == "different":  # driven as it is, too: classes by value do not pass its pipes
-        is_async = False
-    if reuses:  # of which AsyncVectorEnv sends what is there after the reset
-        is_async = False
+    # driven as it is, too: classes by value do not pass its pipes; and of what is reused
+    # AsyncVectorEnv sends what is there after the reset
+    is_async = is_async and observing != "different" and not reuses
     env_fns = [partial(made, observed, acted, number, index, *how) for index in range(count)]
     return Case(number, list(env_fns), mode, is_async, options, observing)
 
@@ -105,11 +104,6 @@ def _reset(draw: Random, count: int) -> dict[str, Any]:
     return found | draw.choice([{"options": options}, {"options": options}, {}])
 
 
-def _each(draw: Random, count: int) -> Call:
-    values: Any = draw.choice([[draw.random() for _ in range(count)], "text", 3, None, [1]])
-    return "set_attr", ("note", values), {}
-
-
 _HANDED = {
     name: value
     for name, value in (handed.PLAIN | handed.PICKLED).items()
@@ -118,46 +112,38 @@ _HANDED = {
 }
 
 
-def _held(draw: Random, count: int) -> Call:
-    values = [_HANDED[draw.choice(list(_HANDED))] for _ in range(count)]
-    return "set_attr", ("held", values), {}
-
-
-def _told(draw: Random, count: int) -> Call:
-    given, named = (_HANDED[draw.choice(list(_HANDED))] for _ in range(2))
-    return "call", ("told", given), {"named": named}
+def _any(draw: Random) -> Any:
+    return _HANDED[draw.choice(list(_HANDED))]
 
 
 _OTHERS: dict[str, Callable[[Random, int], Call]] = {
     "told": lambda draw, count: ("call", ("told", draw.randrange(9), "x"), {"deep": {"a": [1.5]}}),
-    "told of anything": _told,
-    "held": _held,
+    "told of anything": lambda draw, count: ("call", ("told", _any(draw)), {"named": _any(draw)}),
+    "held": lambda draw, count: ("set_attr", ("held", [_any(draw) for _ in range(count)]), {}),
     "holds": lambda draw, count: ("call", ("holds",), {}),
     "fails": lambda draw, count: ("call", ("fails", draw.choice(["value", "key", "zero"])), {}),
     "missing": lambda draw, count: ("call", ("not_here",), {}),
     "get_attr": lambda draw, count: ("get_attr", (draw.choice(["note", "number"]),), {}),
-    "set_attr": _each,
-    "render": lambda draw, count: ("render", (), {}),
-    "np_random_seed": lambda draw, count: ("np_random_seed", (), {}),
-    "np_random": lambda draw, count: ("np_random", (), {}),
+    "set_attr": lambda draw, count: (
+        "set_attr",
+        ("note", draw.choice([[draw.random() for _ in range(count)], "text", 3, None, [1]])),
+        {},
+    ),
+    **{
+        name: lambda draw, count, name=name: (name, (), {})
+        for name in ("render", "np_random_seed", "np_random")
+    },
 }
 
 
 def difference(drawn: Case, number: int, further: dict[str, Any] | None = None) -> str | None:
     """The first difference in words, or None if there is none in so many calls."""
-    modes: dict[str, Any] = {
-        "autoreset_mode": drawn.mode,
-        "observation_mode": drawn.observation_mode,
-    }
+    modes: Any = {"autoreset_mode": drawn.mode, "observation_mode": drawn.observation_mode}
+    options = {**drawn.options, **(further or {})}
     with warnings.catch_warnings(), by_value():
         warnings.simplefilter("ignore")
         reference = SyncVectorEnv(drawn.env_fns, **modes)
-        env = vector(
-            drawn.env_fns,
-            use_async_envs=drawn.is_async,
-            options={**drawn.options, **(further or {})},
-            **modes,
-        )
+        env = vector(drawn.env_fns, use_async_envs=drawn.is_async, options=options, **modes)
         try:
             return _first(drawn, reference, env, calls(drawn, reference, number))
         finally:

@@ -190,8 +190,6 @@ class Scripted(gym.Env[Any, Any]):
 SIMPLE = ("int", "float", "bool", "text", "bytes", "complex", "none", "scalar", "set", "member")
 STEADY = ("int", "float", "bool", "text", "bytes", "none", "steady", "array", "list", "tuple")
 KINDS = (*SIMPLE, "array", "objects", "list", "tuple", "dict", "dict", "large")
-
-
 ODD_REWARDS: dict[str, Any] = {
     "numbers": np.int64(3),
     "bool": np.bool_(True),

@@ -1,5 +1,6 @@
 """Random spaces, of every kind that Gymnasium has."""
 
+from collections.abc import Callable
 from random import Random
 from typing import Any
 
@@ -8,7 +9,6 @@ import numpy as np
 from gymnasium import spaces
 
 Space = gym.Space[Any]
-
 _FLAT = ("box", "discrete", "multi_discrete", "multi_binary")
 _LOOSE = ("text", "sequence", "graph", "one_of")
 _DEEP = ("dict", "tuple")
@@ -19,8 +19,7 @@ _DEPTH = 2
 
 def space(draw: Random, *, loose: bool, depth: int = 0, least: int = 1) -> Space:
     """A random space; only if it may be ``loose``, one that has no fixed layout. Composite ones
-    have at least so many members.
-    """
+    have at least so many members."""
     kinds = [*_FLAT, *(_LOOSE if loose else ()), *(_DEEP if depth < _DEPTH else ())]
     kind = draw.choice(kinds)
     if kind in _DEEP:
@@ -44,43 +43,24 @@ def _box(draw: Random) -> Space:
     return spaces.Box(0, draw.choice([1, 100]), shape, draw.choice(_INTEGERS))
 
 
-def _discrete(draw: Random) -> Space:
-    return spaces.Discrete(draw.randrange(1, 9), start=draw.choice([0, 0, -3, 5]))
-
-
-def _multi_discrete(draw: Random) -> Space:
-    sizes: Any = draw.choice([[3], [2, 5], [[3, 4], [5, 6]]])
-    return spaces.MultiDiscrete(sizes, dtype=draw.choice([np.int32, np.int64]))
-
-
-def _multi_binary(draw: Random) -> Space:
-    return spaces.MultiBinary(draw.choice([1, 4, [2, 3]]))
-
-
-def _text(draw: Random) -> Space:
-    return spaces.Text(draw.randrange(1, 6), charset=draw.choice(["ab", "héß", "xyz0123"]))
-
-
-def _sequence(draw: Random) -> Space:
-    return spaces.Sequence(_ONE[draw.choice(_FLAT)](draw), stack=draw.random() < 0.3)
-
-
 def _graph(draw: Random) -> Space:
     edges = draw.choice([None, spaces.Discrete(4), spaces.Box(0, 1, (2,))])
     return spaces.Graph(draw.choice([spaces.Box(-1, 1, (2,)), spaces.Discrete(3)]), edges)
 
 
-def _one_of(draw: Random) -> Space:
-    return spaces.OneOf([_ONE[draw.choice(_FLAT)](draw) for _ in range(draw.randrange(1, 4))])
-
-
-_ONE = {
+_ONE: dict[str, Callable[[Random], Space]] = {
     "box": _box,
-    "discrete": _discrete,
-    "multi_discrete": _multi_discrete,
-    "multi_binary": _multi_binary,
-    "text": _text,
-    "sequence": _sequence,
+    "discrete": lambda draw: spaces.Discrete(
+        draw.randrange(1, 9), start=draw.choice([0, 0, -3, 5])
+    ),
+    "multi_discrete": lambda draw: spaces.MultiDiscrete(
+        draw.choice([[3], [2, 5], [[3, 4], [5, 6]]]), dtype=draw.choice([np.int32, np.int64])
+    ),
+    "multi_binary": lambda draw: spaces.MultiBinary(draw.choice([1, 4, [2, 3]])),
+    "text": lambda draw: spaces.Text(
+        draw.randrange(1, 6), charset=draw.choice(["ab", "héß", "xyz0123"])
+    ),
+    "sequence": lambda draw: spaces.Sequence(flat_space(draw), stack=draw.random() < 0.3),
     "graph": _graph,
-    "one_of": _one_of,
+    "one_of": lambda draw: spaces.OneOf([flat_space(draw) for _ in range(draw.randrange(1, 4))]),
 }

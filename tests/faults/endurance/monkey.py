@@ -41,7 +41,6 @@ from tests.support import inside
 from tests.support.samples import make_env_of, sample
 
 PLACES = ("process", "tcp", "fleet")
-
 NAMES = ("walk", "cartpole")
 MIB = 1 << 20
 LIVE, SLOW, HANG, EXIT = 0, 4, 5, 6
@@ -51,6 +50,7 @@ _WARM_UP = 0.1
 _SETTLE_S = 60.0
 _HANG_S = 300.0
 """An operation that takes longer hangs: it is shown where, and that is the end."""
+_REPORT_S = 60
 _AMID_S = 0.001
 _PATIENCE = 200
 """Operations that an environment may outlive a kill of one of its processes."""
@@ -131,18 +131,12 @@ class Monkey:
     """What does one thing after another, and how often it did."""
 
     def __init__(
-        self,
-        sandbox: Any,
-        environments: int,
-        seed: int,
-        kill_every: int,
-        far: Sequence[clients.Server] = (),
+        self, sandbox: Any, environments: int, seed: int, kill_every: int, far: Any = ()
     ) -> None:
-        self._sandbox, self._most = sandbox, environments
+        self._sandbox, self._most, self._kill_every = sandbox, environments, kill_every
         self._far = {server.endpoint: server for server in far}
         self._rng = np.random.default_rng(seed)
         self._subjects: list[Subject] = []
-        self._kill_every = kill_every
         self.counts: Counter[str] = Counter()
         self.mismatches: list[str] = []
 
@@ -177,13 +171,14 @@ class Monkey:
 
     def _note(self, subject: Subject, action: Callable[..., Any], error: Exception) -> None:
         said = f"{action.__name__} of {subject.name} n={subject.n_envs} workers={subject.workers} "
-        said += f"{subject.lane} at {self.counts['operations']}: "
-        said += "".join(traceback.format_exception(error))
-        print(said, file=sys.stderr, flush=True)
-        self.mismatches.append(said)
+        self._mismatch(f"{said}{subject.lane} at {self.counts['operations']}: ", error)
         self._subjects.remove(subject)
         with contextlib.suppress(Exception):
             subject.suites.close()
+
+    def _mismatch(self, what: str, error: Exception) -> None:
+        self.mismatches.append(what + "".join(traceback.format_exception(error)))
+        print(self.mismatches[-1], file=sys.stderr, flush=True)
 
     def _chosen(self, subject: Subject) -> Callable[[Subject], None]:
         rare = self._rng.random() * self._kill_every < 1
@@ -209,9 +204,7 @@ class Monkey:
         try:
             self._subjects.append(Subject(self._rng, self._sandbox))
         except errors.EnvHubError as error:
-            said = "open: " + "".join(traceback.format_exception(error))
-            print(said, file=sys.stderr, flush=True)
-            self.mismatches.append(said)
+            self._mismatch("open: ", error)
 
     def _close(self, subject: Subject) -> None:
         self._subjects.remove(subject)
@@ -253,21 +246,18 @@ class Monkey:
         subject.env.step_async(actions)
         subject.pending = actions
 
-    def _collect(self, subject: Subject) -> None:
-        got = subject.env.step_wait()
+    def _collect(self, subject: Subject, timeout: float | None = None) -> None:
+        got = subject.env.step_wait(timeout=timeout)
         actions, subject.pending = subject.pending, None
         self._compare(got, subject.model.step(actions))
 
     def _late(self, subject: Subject) -> None:
         """Sooner than it can be; the reply must never be taken for another."""
         try:
-            got = subject.env.step_wait(timeout=float(self._rng.random() * SLOW_S))
+            self._collect(subject, float(self._rng.random() * SLOW_S))
         except errors.WorkerTimeoutError:
             self.counts["time-outs"] += 1
             subject.lost()
-        else:
-            actions, subject.pending = subject.pending, None
-            self._compare(got, subject.model.step(actions))
 
     def _ask(self, subject: Subject) -> None:
         name = {"walk": "steps", "cartpole": "steps_beyond_terminated"}[subject.name]
@@ -279,8 +269,8 @@ class Monkey:
         if subject.name != "walk":
             return
         name, values = "position", self._rng.random(subject.n_envs).tolist()
-        subject.env.set_attr(name, values)
-        subject.model.set_attr(name, values)
+        for env in (subject.env, subject.model):
+            env.set_attr(name, values)
         if subject.env.get_attr(name) != subject.model.get_attr(name):
             raise Mismatch(name)
 
@@ -301,8 +291,7 @@ class Monkey:
 
     def _pids(self, subject: Subject) -> list[int]:
         """None where it has no jail; or where that may have died, which it has not noticed so; or
-        where a server is too busy to answer within the second that a status waits for.
-        """
+        where a server is too busy to answer within the second that a status waits for."""
         leases = inside.leases(subject.env) if subject.ready else []
         answers = [one.status() for one in leases if one.loaded]
         found = [pid for answer in answers for pid in answer.get("pids", ())]
@@ -403,11 +392,9 @@ class Monkey:
 class Place:
     """Where the environments are: what is to be looked at there."""
 
-    def __init__(
-        self, folder: Path, server: clients.Server | None, others: Sequence[clients.Server] = ()
-    ) -> None:
-        self._folder, self._server = folder, server
-        self.others = others
+    def __init__(self, folder: Path, *servers: clients.Server) -> None:
+        self._folder, self._server = folder, servers[0] if servers else None
+        self.others = servers[1:]
         """Further servers of a fleet, which are killed and started."""
 
     def sandbox(self) -> Any:
@@ -436,20 +423,13 @@ def _place(name: str) -> Iterator[Place]:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="monkey-")))
         folder.chmod(0o711)  # a jail has another user where this one is root
-        if name == "tcp":
-            server = stack.enter_context(clients.serving(folder))
-            yield Place(server.place, server)
-            return
-        if name == "fleet":
-            folders = [folder / name for name in ("stays", "a", "b")]
-            for one in folders:
-                one.mkdir()
-            found = [stack.enter_context(clients.serving(one)) for one in folders]
-            yield Place(found[0].place, found[0], found[1:])
-            return
-        # of this process, which was started for it alone
-        os.environ["TMPDIR"], tempfile.tempdir = str(folder), str(folder)
-        yield Place(folder, None)
+        servers = []
+        for one in {"tcp": ("alone",), "fleet": ("stays", "a", "b")}.get(name, ()):
+            (folder / one).mkdir()
+            servers.append(stack.enter_context(clients.serving(folder / one)))
+        if not servers:  # of this process, which was started for it alone
+            os.environ["TMPDIR"], tempfile.tempdir = str(folder), str(folder)
+        yield Place(servers[0].place if servers else folder, *servers)
 
 
 def run(arguments: argparse.Namespace, name: str) -> dict[str, Any]:
@@ -483,7 +463,7 @@ def _play(monkey: Monkey, arguments: argparse.Namespace, begun: float, part: flo
     while (now := time.monotonic()) < end and not _has_done(monkey, least, part == 1):
         faulthandler.dump_traceback_later(_HANG_S, exit=True)
         monkey.once()
-        if now > told + arguments.report_s:
+        if now > told + _REPORT_S:
             told = now
             size = psutil.Process().memory_full_info().uss / MIB
             said = f"{len(monkey.mismatches)} mismatches, {size:.0f} MiB: {dict(monkey.counts)}"
@@ -500,7 +480,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--places", nargs="+", choices=PLACES, default=PLACES)
     parser.add_argument("--environments", type=int, default=12, help="at most, at one time")
     parser.add_argument("--kill-every", type=int, default=100, help="operations, about")
-    parser.add_argument("--report-s", type=float, default=60, help="seconds; to stderr")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--one", choices=PLACES, help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)

@@ -10,7 +10,6 @@ from typing import Any
 MODES = ("sync", "async", "suite")
 """``SyncVectorEnv`` in one process; ``AsyncVectorEnv`` in two shards; one of a suite's tasks."""
 LANES = ("auto", "frames")
-
 FAULTS = {
     "missing": "imports a package that is not there",
     "raise": "raises `ValueError`",
@@ -40,7 +39,6 @@ MOMENTS = {
     "close": "in `close`",
 }
 LOADING = ("import", "make", "init")
-
 USABLE = "goes on at once"
 RESET = "`reset()` brings it back"
 AGAIN = "make it again"
@@ -148,7 +146,6 @@ _SEEN: dict[str, Any] = {
     "memory": _died("out of memory", signal="SIGKILL", reason="out-of-memory"),
     "cpu": _died("cpu limit", signal="SIGXCPU", reason="cpu-limit"),
 }
-
 ROWS = tuple(_rows())
 
 

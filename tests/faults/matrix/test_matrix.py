@@ -26,7 +26,6 @@ _HANGS = ("hang", "stop")
 _WAIT_S = 60.0
 #: A generous bound on everything that must be noticed, and not be waited for.
 BOUND_S = 120.0
-
 _FULL = os.environ.get("ENVHUB_FAULTS") == "full"
 _MEASURED = os.environ.get("ENVHUB_FAULTS_MEASURED")
 

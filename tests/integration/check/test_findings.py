@@ -252,8 +252,7 @@ def test_an_author_does_not_set_his_rules(tmp_path: Path, monkeypatch: pytest.Mo
     refused = envhub("check", "env.py", "--settings", "envhub.toml")
     assert (refused.returncode, "is inside the repository" in refused.stderr) == (2, True)
     (tmp_path / "envhub.toml").write_text(says)
-    allowed = envhub("check", ".", "--settings", "../envhub.toml")
-    assert allowed.returncode == 0, allowed.stderr
+    envhub("check", ".", "--settings", "../envhub.toml", code=0)
 
 
 def test_what_changes_meanwhile_is_not_judged(tmp_path: Path) -> None:
@@ -285,13 +284,11 @@ def test_missing_papers_are_told(tmp_path: Path) -> None:
 def test_the_command_line_judges(tmp_path: Path) -> None:
     """Exit codes, and the reports that were asked for; a name that a terminal would obey is a
     finding, and no reason not to judge."""
-    good = envhub("check", EXAMPLES / "cartpole", "--steps", "20", "--json")
-    assert good.returncode == 0, good.stderr
+    good = envhub("check", EXAMPLES / "cartpole", "--steps", "20", "--json", code=0)
     assert json.loads(good.stdout)["passed"] is True
     folder = repository(tmp_path / "walk", _HONEST.replace("self.reward()", "1 / 0"))
     files = [f"--{kind}={tmp_path / kind}" for kind in ("junit", "sarif", "html")]
-    bad = envhub("check", folder, "--steps", "5", *files)
-    assert bad.returncode == 1, bad.stderr
+    bad = envhub("check", folder, "--steps", "5", *files, code=1)
     assert "ZeroDivisionError" in bad.stdout
     told = (tmp_path / "html").read_text()
     assert "ZeroDivisionError" in told
@@ -307,8 +304,7 @@ def test_the_command_line_judges(tmp_path: Path) -> None:
     error = json.loads(refused.stdout)["error"]
     assert (error["type"], error["exit_code"]) == ("PolicyError", 2)
     assert f"{policy}: " in error["message"]
-    allowed = envhub("check", folder, "--steps", "5", "--allow", "runs", "--github")
-    assert allowed.returncode == 0, allowed.stderr
+    allowed = envhub("check", folder, "--steps", "5", "--allow", "runs", "--github", code=0)
     assert allowed.stderr.endswith(": passed.\n")
     [command] = obeyed(allowed.stdout)
     line = _HONEST.partition("self.reward()")[0].count("\n") + 1

@@ -10,10 +10,8 @@ from pathlib import Path
 
 import psutil
 import pytest
-from typer.testing import CliRunner
 
 from envhub_sandbox import make_env
-from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.cache import stored_snapshots
 from envhub_sandbox.extras.packages import environments
 from envhub_sandbox.hub import snapshot
@@ -21,12 +19,10 @@ from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.system.locks import SharedLock
 from envhub_worker.protocol.runtime import RECORD
 from tests.faults.remains.traces import temporary_root
-from tests.support.command_line import COMMAND
+from tests.support.command_line import COMMAND, document, envhub
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.repositories import write_repository
 from tests.support.samples import sample
-
-RUNNER = CliRunner()
 
 
 @pytest.fixture
@@ -44,17 +40,14 @@ def stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_list_shows_what_is_stored(stored: list[str]) -> None:
-    done = RUNNER.invoke(app, ["cache", "list", "--json"])
-    found = json.loads(done.stdout)
-    assert [one["commit"] for one in found["snapshots"]] == stored
-    assert all(one["bytes"] == len("NAME = 'a'\n") for one in found["snapshots"])
-    assert found["folder"] == str(cache_root())
+    found = document("cache", "list")
     folders = [str(cache_root().parent / name) for name in "abc"]
-    assert [one["folder"] for one in found["snapshots"]] == folders
-    text = RUNNER.invoke(app, ["cache", "list"]).stdout
-    rows = [line.split()[:2] for line in text.splitlines()[1:4]]
+    facts = [(one["commit"], one["bytes"], one["folder"]) for one in found["snapshots"]]
+    assert facts == [*zip(stored, [len("NAME = 'a'\n")] * 3, folders, strict=True)]
+    assert found["folder"] == str(cache_root())
+    rows = [line.split()[:2] for line in envhub("cache", "list").stdout.splitlines()[1:4]]
     assert rows == [[name, commit[:18]] for name, commit in zip(folders, stored, strict=True)]
-    assert RUNNER.invoke(app, ["cache", "remove", folders[0]]).exit_code == 0
+    envhub("cache", "remove", folders[0], code=0)
     assert [one.commit for one in stored_snapshots()] == stored[1:]
 
 
@@ -66,13 +59,12 @@ def test_wheels_that_were_built_here_are_listed_and_removed(stored: list[str]) -
         make_wheel(home, name)
         (home / "built.json").write_text("{}")
     os.utime(home / "built.json", (1e9, 1e9))
-    listed = json.loads(RUNNER.invoke(app, ["cache", "list", "--json"]).stdout)["wheels"]
     names = ["one_wheel-1.0-py3-none-any.whl", "other-1.0-py3-none-any.whl"]
-    assert [one["file"] for one in listed] == names
-    assert all(name in RUNNER.invoke(app, ["cache", "list"]).stdout for name in names)
+    assert [one["file"] for one in document("cache", "list")["wheels"]] == names
+    assert all(name in envhub("cache", "list").stdout for name in names)
     for words in (["one-wheel"], ["--unused-for", "30"]):
-        done = RUNNER.invoke(app, ["cache", "remove", *words])
-        assert "Removed 0 snapshots, 0 environments, 1 wheel, " in done.stderr
+        told = envhub("cache", "remove", *words).stderr
+        assert "Removed 0 snapshots, 0 environments, 1 wheel, " in told
     assert (list((cache_root() / "wheels").iterdir()), len(stored_snapshots())) == ([], 3)
 
 
@@ -104,9 +96,7 @@ def test_hub_repositories_are_named_as_they_are_written(
 def test_remove_takes_only_what_is_meant(stored: list[str], what: str, left: list[int]) -> None:
     """By the beginning of a commit, or unused for so many days."""
     words = [stored[1][:20]] if what == "its commit" else ["--unused-for", "1.5"]
-    done = RUNNER.invoke(app, ["cache", "remove", *words])
-    assert done.exit_code == 0
-    assert "Removed 1 snapshot" in done.stderr
+    assert "Removed 1 snapshot" in envhub("cache", "remove", *words, code=0).stderr
     assert [one.commit for one in stored_snapshots()] == [stored[index] for index in left]
 
 
@@ -118,19 +108,16 @@ def test_a_snapshot_that_is_used_is_kept(stored: list[str], tmp_path: Path) -> N
     assert (cache_root() / "manifests").is_dir() is False
     with make_env(folder) as suites:
         assert (cache_root() / "manifests").is_dir()
-        done = RUNNER.invoke(app, ["cache", "remove", "--all"])
-        assert done.exit_code == 0
-        assert "Removed 3 snapshots" in done.stderr
-        assert f"process {os.getpid()} (" in done.stderr
+        told = envhub("cache", "remove", "--all", code=0).stderr
+        assert "Removed 3 snapshots" in told
+        assert f"process {os.getpid()} (" in told
         assert not (cache_root() / "manifests").exists(), "descriptions are forgotten, too"
         suites.env.reset(seed=0)
     assert [one.commit for one in stored_snapshots()] == [suites.provenance["commit"]]
 
 
 def test_remove_of_an_unknown_name_is_usage(stored: list[str]) -> None:
-    done = RUNNER.invoke(app, ["cache", "remove", stored[0], "nobody/knows"])
-    assert done.exit_code == 2
-    assert "nobody/knows" in done.stderr
+    assert "nobody/knows" in envhub("cache", "remove", stored[0], "nobody/knows", code=2).stderr
     assert len(stored_snapshots()) == 3
 
 
@@ -139,20 +126,17 @@ def environment(index: Index, tmp_path: Path) -> str:
     """A repository whose packages have been made ready by the command; its environment's name."""
     make_wheel(index.folder, "wanted")
     folder = write_repository(tmp_path / "repo", "X = 1\n", requirements__txt="wanted\n")
-    done = RUNNER.invoke(app, ["inspect", "--download", str(folder), "--json"])
-    assert done.exit_code == 0, done.stderr
-    made = json.loads(done.stdout)["environment"]
+    made = document("inspect", "--download", folder)["environment"]
     assert "wanted==1.0" in made["packages"]
     assert Path(made["folder"], "packages/wanted/__init__.py").is_file()
     return Path(made["folder"]).name
 
 
 def test_environments_are_listed(environment: str) -> None:
-    [found] = json.loads(RUNNER.invoke(app, ["cache", "list", "--json"]).stdout)["environments"]
-    assert found["name"] == environment
+    [found] = document("cache", "list")["environments"]
+    assert (found["name"], found["bytes"] > 0) == (environment, True)
     assert "wanted==1.0" in found["packages"]
-    assert found["bytes"] > 0
-    done = RUNNER.invoke(app, ["cache", "list"])
+    done = envhub("cache", "list")
     assert environment[:12] in done.stdout
     assert "1 snapshot, 1 environment" in done.stderr
 
@@ -163,25 +147,20 @@ def test_environments_are_removed(environment: str) -> None:
     half.mkdir()
     used = time.time() - 86400 * 3
     os.utime(environments.root() / environment / "environment.json", (used, used))
-    kept = RUNNER.invoke(app, ["cache", "remove", "--unused-for", "4"])
-    assert "0 environments" in kept.stderr
-    named = RUNNER.invoke(app, ["cache", "remove", environment[:9]])
-    assert "1 environment" in named.stderr
-    assert environments.every() == []
-    assert not half.exists()
+    assert "0 environments" in envhub("cache", "remove", "--unused-for", "4").stderr
+    assert "1 environment" in envhub("cache", "remove", environment[:9]).stderr
+    assert (environments.every(), half.exists()) == ([], False)
 
 
 def test_environments_in_use_are_kept(environment: str) -> None:
     """Named, that is an error which says by whom; among others, a line."""
     lock = SharedLock(environments.root() / environment / RECORD)
     user = f"{environment[:12]} is in use by process {os.getpid()}"
-    named = RUNNER.invoke(app, ["cache", "remove", environment[:9]])
-    assert named.exit_code == 2
-    assert user in " ".join(named.stderr.split())
-    swept = RUNNER.invoke(app, ["cache", "remove", "--unused-for", "0"])
-    assert swept.exit_code == 0
+    named = envhub("cache", "remove", environment[:9], code=2)
+    swept = envhub("cache", "remove", "--unused-for", "0", code=0)
     assert "0 environments" in swept.stderr
-    assert user in " ".join(swept.stderr.split())
+    for told in (named, swept):
+        assert user in " ".join(told.stderr.split())
     assert len(environments.every()) == 1
     lock.release()
 
@@ -189,25 +168,17 @@ def test_environments_in_use_are_kept(environment: str) -> None:
 def test_newer_versions_are_chosen_if_asked(index: Index, environment: str, tmp_path: Path) -> None:
     """And then the next ``make_env`` has them, too."""
     make_wheel(index.folder, "wanted", "2.0")
-    folder = str(tmp_path / "repo")
-    same = json.loads(RUNNER.invoke(app, ["inspect", "--download", folder, "--json"]).stdout)
-    assert Path(same["environment"]["folder"]).name == environment
-    newer = json.loads(
-        RUNNER.invoke(app, ["inspect", "--download", folder, "--upgrade", "--json"]).stdout
-    )
-    assert "wanted==2.0" in newer["environment"]["packages"]
+    asked = ("inspect", "--download", tmp_path / "repo")
+    assert Path(document(*asked)["environment"]["folder"]).name == environment
+    assert "wanted==2.0" in document(*asked, "--upgrade")["environment"]["packages"]
 
 
 def test_a_repository_that_needs_nothing_is_only_downloaded(tmp_path: Path) -> None:
     folder = write_repository(tmp_path / "repo", "X = 1\n", requirements__txt="numpy\n")
-    done = RUNNER.invoke(app, ["inspect", "--download", str(folder)])
-    assert done.exit_code == 0
+    done = envhub("inspect", "--download", folder, code=0)
     assert str(folder) in done.stdout
     assert "this interpreter" in done.stderr
-    assert (
-        RUNNER.invoke(app, ["inspect", "--download", str(folder), "--dependencies", "{"]).exit_code
-        == 2
-    )
+    envhub("inspect", "--download", folder, "--dependencies", "{", code=2)
 
 
 # --- ``envhub cache gc``, as a user runs it

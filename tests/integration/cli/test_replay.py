@@ -25,13 +25,11 @@ def test_the_pinned_commit_runs_again(
     place = {"endpoint": olah.endpoint, "hub_cache_dir": hub_cache}
     bundle = crashed(tmp_path / "crashes", "org/cli-replays@main", **place)
     repository.commit({"env.py": code.replace("os._exit(7)", "os._exit(8)")})
-    refused = envhub("replay", bundle)
-    assert refused.returncode == 2
+    refused = envhub("replay", bundle, code=2)
     assert "endpoint=" in refused.stderr
     assert "--grant" in refused.stderr
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    done = envhub("replay", bundle, "--grant")
-    assert done.returncode == 0, done.stderr
+    done = envhub("replay", bundle, "--grant", code=0)
     assert f"org/cli-replays@{commit[:12]}" in done.stdout
     assert done.stdout.count("request 4, step 3: exit (exit code 7)\n") == 2
 
@@ -40,8 +38,7 @@ def test_only_the_callers_own_bundle_needs_no_grant(tmp_path: Path) -> None:
     """Somebody else's opens no network, folder or repository of the caller's, unless he grants it.
     What this program has written, where it writes bundles, is his own."""
     bundle = crashed(tmp_path, sample("faulty"), policy={"network": "loopback"})
-    refused = envhub("replay", bundle)
-    assert refused.returncode == 2
+    refused = envhub("replay", bundle, code=2)
     assert "network='loopback'" in refused.stderr
     assert f"repository='{sample('faulty')}" in refused.stderr
     assert envhub("replay", bundle, "--grant").returncode == 0
@@ -60,8 +57,7 @@ def test_what_cannot_be_replayed_is_refused(tmp_path: Path) -> None:
     document = json.loads(file.read_text())
     document["task"]["suite"] = "\x1b[31mother"
     file.write_text(json.dumps(document))
-    refused = envhub("replay", bundle, "--grant")
-    assert refused.returncode == 2
+    refused = envhub("replay", bundle, "--grant", code=2)
     assert "so nothing can be repeated" in refused.stderr
     assert "\x1b" not in refused.stderr
 
@@ -101,7 +97,6 @@ def test_a_config_and_a_task_are_found_again(tmp_path: Path) -> None:
         env.reset(seed=1)
         with pytest.raises(errors.WorkerDiedError) as caught:
             _ = [env.step([0]) for _ in range(10)]
-    done = envhub("replay", str(caught.value.bundle), "--grant", "--json")
-    assert done.returncode == 0, done.stderr
+    done = envhub("replay", str(caught.value.bundle), "--grant", "--json", code=0)
     document = json.loads(done.stdout)
     assert document["replayed"]["steps"] == 5

@@ -21,7 +21,6 @@ import os
 print("printed by Python")
 os.system("echo printed by a child")
 {CARTPOLE}"""
-
 _ONE_ENV = f"""{STILL}
 class One(Still):
     def step(self, action):
@@ -59,8 +58,7 @@ def test_json_says_what_ran_and_how() -> None:
     found = document("run", EXAMPLES / "catch", "--episodes", "5", "--n-envs", "2")
     [task] = found["tasks"]
     assert (task["suite"], task["task"], task["num_envs"]) == ("hub_env", 0, 2)
-    assert [episode["sub_env"] for episode in task["episodes"]].count(0) == 3
-    assert len(task["episodes"]) == 5
+    assert sorted(episode["sub_env"] for episode in task["episodes"]) == [0, 0, 0, 1, 1]
     assert task["length"] == {"mean": 46.0, "std": 0.0, "min": 46.0, "max": 46.0}
     assert task["success_rate"] == task["return"]["mean"], "a caught ball is the only reward"
     assert found["provenance"]["commit"].startswith("local-")
@@ -122,17 +120,15 @@ def test_failures_have_a_code_and_a_message(
 
 def test_stopping_early_is_said(tmp_path: Path) -> None:
     """An environment that never ends can be tried with ``--steps``."""
-    folder = one_env(tmp_path / "one", "return 0, 1.0, False, False, {}")
-    done = envhub("run", folder, "--steps", "20")
-    assert done.returncode == 0
+    endless = one_env(tmp_path / "one", "return 0, 1.0, False, False, {}")
+    done = envhub("run", endless, "--steps", "20", code=0)
     assert "0 (stopped)" in done.stdout
     assert "stopped by --steps" in done.stderr
 
 
 def test_a_repository_that_does_not_load(tmp_path: Path) -> None:
     folder = write_repository(tmp_path / "bad", "import this_is_not_installed\n")
-    done = envhub("run", folder)
-    assert done.returncode == 4
+    done = envhub("run", folder, code=4)
     assert "this_is_not_installed" in done.stderr
     assert "Traceback" not in done.stderr
     assert "Traceback" in envhub("run", folder, "--debug").stderr
@@ -158,8 +154,7 @@ def test_markup_and_messages_are_shown_as_text(tmp_path: Path) -> None:
     """Markup in names and escape sequences in messages of a stranger do nothing to the terminal."""
     folder = hostile_names(tmp_path / "evil", "[bold]s[/bold]", "[red]x[/red]")
     for command in ("run", "inspect"):
-        done = envhub(command, folder)
-        assert done.returncode == 0, done.stderr
+        done = envhub(command, folder, code=0)
         assert "[bold]s[/bold] / [red]x[/red]" in done.stdout.replace("\n", "")
     noisy = envhub("run", sample("noisy"))
     assert r"\x1b[2J" in noisy.stderr
@@ -168,20 +163,17 @@ def test_markup_and_messages_are_shown_as_text(tmp_path: Path) -> None:
 
 def test_without_a_sandbox_it_runs_here_when_trusted(tmp_path: Path) -> None:
     """And says that nothing confined it; its own errors are still its own."""
-    done = program("run", EXAMPLES / "cartpole", "--sandbox", "none", "--trust-remote-code")
-    assert done.returncode == 0, done.stderr
+    done = program("run", EXAMPLES / "cartpole", "--sandbox", "none", "--trust-remote-code", code=0)
     assert "nothing: the code ran in this process" in done.stdout
     folder = one_env(tmp_path / "one", "return {}['missing']")
-    failed = program("run", folder, "--sandbox", "none", "--trust-remote-code")
-    assert failed.returncode == 1
+    failed = program("run", folder, "--sandbox", "none", "--trust-remote-code", code=1)
     assert "KeyError: 'missing'" in failed.stderr
 
 
 def test_prints_stay_off_stdout_without_a_sandbox(tmp_path: Path) -> None:
     """It has the results and nothing else, whoever prints in this process or below it."""
     folder = write_repository(tmp_path / "prints", _PRINTS)
-    done = program("run", folder, "--sandbox", "none", "--trust-remote-code", "--json")
-    assert done.returncode == 0, done.stderr
+    done = program("run", folder, "--sandbox", "none", "--trust-remote-code", "--json", code=0)
     json.loads(done.stdout)
     assert "printed by Python" in done.stderr
     assert "printed by a child" in done.stderr
@@ -204,8 +196,7 @@ def test_diff_compares_spaces_where_that_is_asked_for(tmp_path: Path) -> None:
     new = write_repository(tmp_path / "new", CARTPOLE.replace("CartPole-v1", "Acrobot-v1"))
     read = envhub("diff", old, new)
     assert (read.returncode, "Discrete" in read.stdout) == (7, False), read.stderr
-    ran = envhub("diff", old, new, "--run")
-    assert ran.returncode == 7, ran.stderr
+    ran = envhub("diff", old, new, "--run", code=7)
     assert "actions were Discrete(2), now Discrete(3)" in ran.stdout
 
 

@@ -23,9 +23,6 @@ class Endless(Still):
     def step(self, action):
         time.sleep(%s)
         return super().step(action)
-
-def make_env(n_envs=1, use_async_envs=False):
-    return vector(Endless, n_envs)
 """
 
 

@@ -198,9 +198,6 @@ class Late(Still):
         endless = []
         endless.append(endless)
         return endless
-
-def make_env(n_envs=1, use_async_envs=False):
-    return vector(Late, n_envs)
 """
 
 
@@ -374,8 +371,6 @@ USER_NAMESPACE = (
     "user-namespace | user.max_user_namespaces is 0 | Run: sudo sysctl",
     'by its name: profile "no-userns"',
 )
-
-
 WITHOUT = ["pid-namespace", "mount-namespace", "landlock"]
 RESTRICTED_HOSTS: list[tuple[str, str, Sequence[str]]] = [
     ("strict", "NO_USER_NAMESPACES", USER_NAMESPACE),

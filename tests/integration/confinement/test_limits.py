@@ -20,7 +20,6 @@ from tests.support.interpreter import needs, profiles
 
 MEMORY = 300 * MIB
 BOMB = 700 * MIB
-
 HEAP = f"b = bytearray({BOMB}); b[::4096] = b'x' * len(b[::4096]); result = 'filled'"
 SHARED = f"import mmap; m = mmap.mmap(-1, {BOMB}); m.write(bytes({BOMB})); result = 'filled'"
 MEMFD = f"""

@@ -1,6 +1,4 @@
-"""The Python of the documents does what they say, where it needs more than a repository here; the
-notebook of the examples runs from its first cell to its last, and shows what it shows.
-"""
+"""The Python, the shell and the notebook of the documents run as they are written."""
 
 import json
 import os
@@ -10,9 +8,12 @@ from typing import Any
 
 import pytest
 
+from tests.hub.stub_hub import StubHub
 from tests.support.command_line import python
 from tests.support.documents import blocks
+from tests.support.documents.blocks import Block
 from tests.support.documents.notebook import DOCUMENT
+from tests.support.documents.shell import execute, executed
 from tests.support.samples import EXAMPLES
 
 # No block may take a port that another program has.
@@ -24,7 +25,6 @@ prometheus_client.start_http_server = lambda port: _start(0, addr="127.0.0.1")
 _IMPORTED = "from envhub_sandbox import make_env\n"
 _TAKES_A_SIZE = """
 import gymnasium as gym
-
 
 def make_env(n_envs=1, use_async_envs=False, size=4):
     assert size == 8
@@ -109,3 +109,26 @@ def test_the_notebook_shows_what_it_shows(checkout: Path, tmp_path: Path) -> Non
     assert shown(now) == shown(then)
     assert {"text/html", "image/png", "stdout"} <= {one for kinds in shown(now) for one in kinds}
     assert rewards(now) == rewards(then) != []
+
+
+# What is about a repository is run within one.
+_WITHIN = {"docs/ci.md": "my-env"}
+# What is in no plain installation.
+_NEEDS = {"--video": "imageio_ffmpeg", "--metrics": "prometheus_client"}
+
+
+@pytest.mark.parametrize("document", [one for one in blocks.DOCUMENTS if executed(one)])
+def test_the_shell_of_a_document_runs(document: str, stub_hub: StubHub, tmp_path: Path) -> None:
+    """All of its blocks, one after the other; each command ends well."""
+    for option, needed in _NEEDS.items():
+        if any(option in one.text for one in executed(document)):
+            pytest.importorskip(needed)
+    execute(executed(document), stub_hub, tmp_path, _WITHIN.get(document, ""))
+
+
+@pytest.mark.parametrize(
+    "wrong", ["false && true", "envhub-worker listen --frobnicate", "docker rm --force it"]
+)
+def test_a_block_that_fails_is_found(wrong: str, stub_hub: StubHub, tmp_path: Path) -> None:
+    with pytest.raises(AssertionError):
+        execute([Block("README.md", "sh", f"{wrong}\ntrue\n")], stub_hub, tmp_path)

@@ -13,7 +13,6 @@ from tests.support.samples import Frozen, make_env_of, reference, sample
 
 torch = pytest.importorskip("torch")
 lerobot = pytest.importorskip("tests.support.lerobot")
-
 SUITE = """
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from swing_up import SwingUp

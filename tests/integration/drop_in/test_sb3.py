@@ -37,7 +37,6 @@ import numpy as np
 
 BITS = gym.spaces.MultiBinary(3)
 
-
 class Goals(gym.Env):
     observation_space = gym.spaces.Dict(observation=BITS, achieved_goal=BITS, desired_goal=BITS)
     action_space = gym.spaces.Discrete(3)
@@ -64,13 +63,11 @@ class Goals(gym.Env):
         distance = np.abs(achieved - desired).reshape(-1, 3).sum(axis=1)
         return -(distance > 0).astype(np.float32)
 
-
 def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.SyncVectorEnv([lambda: gym.wrappers.OrderEnforcing(Goals())] * n_envs)
 """
 _PARTS = """
 import gymnasium as gym
-
 
 class Parts(gym.Env):
     observation_space = gym.spaces.Discrete(9)
@@ -82,7 +79,6 @@ class Parts(gym.Env):
 
     def step(self, action):
         return 1, 0.0, False, False, {"action": repr(action)}
-
 
 def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.SyncVectorEnv([Parts] * n_envs)

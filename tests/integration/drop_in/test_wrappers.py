@@ -15,7 +15,6 @@ from tests.support.compare import assert_same
 from tests.support.samples import reference, sample
 
 Wrap = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
-
 WRAPS: dict[str, Wrap] = {
     "NormalizeObservation": wrappers.NormalizeObservation,
     "NormalizeReward": wrappers.NormalizeReward,

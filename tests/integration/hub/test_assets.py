@@ -32,8 +32,6 @@ class Downloads(Still):
         (Path(snapshot_download(repo, repo_type=kind)) / "mesh.txt").write_text("changed")
 
 snapshot_download(OWN)
-def make_env(n_envs=1, use_async_envs=False):
-    return vector(Downloads, n_envs)
 """
 Make = Callable[..., Any]
 

@@ -23,7 +23,6 @@ FILES = {
     "README.md": "---\nlicense: mit\n---\n",
     "empty": "",
 }
-
 Fetch = Callable[..., Snapshot]
 
 

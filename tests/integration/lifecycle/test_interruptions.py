@@ -17,7 +17,6 @@ from tests.support.samples import sample
 from tests.support.started import nothing_more_held
 
 pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-
 _STARTS, _CLOSES = (23, 7) if "ENVHUB_TEST_LONG" in os.environ else (167, 41)
 """Calls between two moments: of some 500 in a start, and of some 120 in a close."""
 _WAYS: dict[str, dict[str, Any]] = {

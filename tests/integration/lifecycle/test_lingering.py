@@ -15,8 +15,6 @@ from tests.support.processes import descendants, eventually
 from tests.support.samples import sample
 
 _ONLY_SERVER = 3  # the server, and its zygote's two
-
-
 _BEFORE: set[int] = set()
 """What ran below this process before the test: other tests' Hubs, say."""
 

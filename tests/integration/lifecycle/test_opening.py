@@ -103,7 +103,6 @@ class Counting(Still):
         # the pid that the kernel gave out last, in the pid namespace of who reads it
         return int(open("/proc/loadavg").read().split()[-1])
 
-
 def make_env(n_envs, use_async_envs, context, tasks, looks_into_them=False):
     def task():
         if not use_async_envs:

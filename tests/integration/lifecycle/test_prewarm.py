@@ -1,6 +1,4 @@
-"""Processes that start before anybody asks for them, and the next tasks of a suite, started while
-one plays: bounded, given up, and never felt.
-"""
+"""Processes and next tasks that start before anybody asks: bounded, given up, never felt."""
 
 import concurrent.futures
 import contextlib
@@ -93,11 +91,8 @@ def states(tasks: Tasks) -> list[str]:
 def ahead(tasks: Tasks) -> list[int]:
     """Which ones are up, and were never asked anything."""
     found = [env.sandbox.stats() for env in tasks]
-    return [
-        index
-        for index, one in enumerate(found)
-        if one["state"] == "READY" and one["requests"] == one["steps"] == 0
-    ]
+    idle = {"state": "READY", "requests": 0, "steps": 0}
+    return [index for index, one in enumerate(found) if {**one, **idle} == one]
 
 
 def settled(tasks: Tasks, expected: list[int]) -> bool:
@@ -159,10 +154,8 @@ def test_one_task_outlives_the_suite_that_it_came_from(repository: Path) -> None
     """Whoever takes one, and lets the others go, can use it."""
     env = make_env(repository, env_kwargs={"tasks": 3})["suite0"][1]
     gc.collect()
-    try:
+    with contextlib.closing(env):
         assert env.reset()[0][0][0] == 1.0
-    finally:
-        env.close()
 
 
 def test_closing_what_is_being_given_up_leaves_no_server(tasks: Callable[..., Tasks]) -> None:
@@ -190,10 +183,9 @@ def test_closing_what_is_being_given_up_leaves_no_server(tasks: Callable[..., Ta
 def gated(tmp_path: Path) -> tuple[Path, Path, dict[str, Any]]:
     """A repository whose task 1 is made once there is a file; the file; the policy to see it.
     Its manifest is remembered."""
-    gate = tmp_path / "gate"
+    gate, opened = tmp_path / "gate", tmp_path / "gate" / "open"
     gate.mkdir()
     gate.chmod(0o755)
-    opened = gate / "open"
     held_up = f"        while task == 1 and not os.path.exists({str(opened)!r}):"
     suite = SUITE.replace(
         "        self.task, self.made", f"{held_up}\n            pass\n        self.task, self.made"
@@ -249,9 +241,7 @@ def test_what_fails_is_raised_by_the_tasks_first_request(tasks: Callable[..., Ta
     assert settled(envs, [])
     with pytest.raises(RemoteEnvError, match="task 1 cannot be made"):
         envs[1].reset()
-    observations, _ = envs[2].reset()
-    assert observations[0][0] == 2.0
-    assert set(_bundles()) == bundles
+    assert (envs[2].reset()[0][0][0], set(_bundles())) == (2.0, bundles)
 
 
 def test_what_dies_unused_is_started_again(tasks: Callable[..., Tasks]) -> None:
@@ -270,8 +260,7 @@ def test_what_dies_unused_is_started_again(tasks: Callable[..., Tasks]) -> None:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
     assert eventually(lambda: descendants() <= server)  # others' may end meanwhile
-    observations, _ = envs[1].reset()
-    assert observations[0][0] == 1.0
+    assert envs[1].reset()[0][0][0] == 1.0
 
 
 def test_closed_in_the_midst_it_leaves_nothing(repository: Path) -> None:
@@ -322,10 +311,8 @@ def test_suites_do_not_start_each_others_tasks(tasks: Callable[..., Tasks]) -> N
 
 
 def played(env: Any) -> list[Any]:
-    found = [env.reset(seed=7)[0].tolist()]
-    for _ in range(5):
-        found.append([part.tolist() for part in env.step(np.ones(1, int))[:4]])
-    return found
+    first = env.reset(seed=7)[0].tolist()
+    return [first, *([part.tolist() for part in env.step([1])[:4]] for _ in range(5))]
 
 
 def test_threads_may_play_tasks_at_once(tasks: Callable[..., Tasks]) -> None:
@@ -361,8 +348,7 @@ def test_the_first_reset_finds_what_was_started() -> None:
     with make_env(sample("counter"), n_envs=2) as suites:
         env = suites.env
         assert env.sandbox.stats()["state"] == "IDLE"
-        env.prewarm()
-        env.prewarm()
+        env.prewarm(), env.prewarm()
         assert eventually(lambda: env.sandbox.stats()["state"] == "READY")
         started = descendants()
         env.prewarm()

@@ -68,9 +68,8 @@ class TestWhereTheCodeRuns:
         assert pids == [pid]
         assert not marker.exists(), "the worker saw a variable of the caller's environment"
         fresh = set(sys.modules) - before
-        folder = str(sample("marker"))
-        files = {str(getattr(sys.modules[name], "__file__", "")) for name in fresh}
-        assert not [file for file in files if file.startswith(folder)]
+        files = [str(getattr(sys.modules[name], "__file__", "")) for name in fresh]
+        assert not [file for file in files if file.startswith(str(sample("marker")))]
         assert not {name for name in fresh if name.split(".")[0] in ("worker", "parts", "hub_env")}
 
     def test_without_a_sandbox_the_same_marker_names_this_process(
@@ -84,21 +83,24 @@ class TestWhereTheCodeRuns:
         try:
             make_env_of(sample("marker"))
         finally:
-            for name in [n for n in sys.modules if n.startswith("reference_samples_marker")] + [
-                "worker"
-            ]:
-                sys.modules.pop(name, None)
+            for name in [*sys.modules]:
+                if name == "worker" or name.startswith("reference_samples_marker"):
+                    del sys.modules[name]
         assert marker.read_text().split() == [str(os.getpid())]
 
     def test_siblings_assets_and_dataclasses_work(self) -> None:
         """Siblings, relative imports, assets by both kinds of path, postponed annotations."""
         with make_env(sample("marker")) as suites:
             env = suites.env
-            assert env.get_attr("own_worker") == ("the repository's own worker.py",)
-            assert env.get_attr("asset_by_file") == ("hello from an asset",)
-            assert env.get_attr("asset_by_cwd") == ("hello from an asset",)
-            [text] = env.get_attr("settings_repr")
-            assert text == "Settings(size=3, bolts=[Bolt(diameter=4)])"
+            for name, value in (
+                ("own_worker", "the repository's own worker.py"),
+                *(
+                    ("asset_by_file", "hello from an asset"),
+                    ("asset_by_cwd", "hello from an asset"),
+                ),
+                ("settings_repr", "Settings(size=3, bolts=[Bolt(diameter=4)])"),
+            ):
+                assert env.get_attr(name) == (value,)
 
     @pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
     def test_classes_of_the_repository_can_be_pickled_to_its_children(self, method: str) -> None:
@@ -112,16 +114,14 @@ class TestWhereTheCodeRuns:
             [written] = suites.env.get_attr("written")
             roll(suites.env)
         assert len(set(written)) == 3
-        assert not (Path.home() / "scribbled.txt").exists()
-        assert not (Path.cwd() / "scribbled.txt").exists()
-        assert not (sample("scribbler") / "scribbled.txt").exists()
-        assert not [path for path in written if Path(path).exists()]
+        ours = [one / "scribbled.txt" for one in (Path.home(), Path.cwd(), sample("scribbler"))]
+        assert not [path for path in (*written, *ours) if Path(path).exists()]
 
     def test_make_env_runs_on_the_main_thread(self) -> None:
         """Signal handlers can be set at import, which only the main thread may."""
         with make_env(sample("signal_handlers"), n_envs=2) as suites:
-            assert suites.env.get_attr("imported_on_main_thread") == (True, True)
-            assert suites.env.get_attr("built_on_main_thread") == (True, True)
+            for moment in ("imported", "built"):
+                assert suites.env.get_attr(f"{moment}_on_main_thread") == (True, True)
 
 
 @pytest.mark.short
@@ -168,17 +168,14 @@ class TestLayouts:
 
     def test_config_object(self) -> None:
         """A config's attributes cross, also those that are no fields; dicts stay dicts."""
-        cfg = SimpleNamespace(
-            hub_path=str(sample("cfg_reader")), task="CartPole-v1", episode_length=3
-        )
-        cfg.camera = {"width": 64}
+        cfg = SimpleNamespace(hub_path=str(sample("cfg_reader")), task="CartPole-v1")
+        cfg.episode_length, cfg.camera = 3, {"width": 64}
         cfg.robot = SimpleNamespace(name="arm")
         with make_env(cfg, n_envs=2) as suites:
             env = suites.env
             names = ["camera", "episode_length", "hub_path", "robot", "task"]
-            assert env.get_attr("told") == (names, names)
-            assert env.get_attr("camera_width") == (64, 64)
-            assert env.get_attr("robot") == ("arm", "arm")
+            for name, value in (("told", names), ("camera_width", 64), ("robot", "arm")):
+                assert env.get_attr(name) == (value, value)
             *_, truncations, _ = roll(env, steps=3)
             assert truncations.all()
 
@@ -217,7 +214,7 @@ class TestWhatMakeEnvReturns:
     def test_a_gym_env_that_is_batched_is_a_vector(self, tmp_path: Path, form: str) -> None:
         """As LeRobot steps it, when it is in a suite: no dimension is added."""
         single = (
-            "single_observation_space, single_action_space = Box(-1, 1, (54,)), Box(-1, 1, (6,))"
+            "single_observation_space = Box(-1, 1, (54,)); single_action_space = Box(-1, 1, (6,))"
         )
         text = _BATCHED.format(single=single, form=form.replace("ENV", "Batched()"))
         with make_env(write_repository(tmp_path / "it", text), n_envs=1) as suites:
@@ -270,11 +267,11 @@ class TestWhatMakeEnvReturns:
             for scale in (0.1, -0.3, 1.0):
                 actions = np.full((3, 1), scale, np.float32)
                 assert_same(expected.step(actions), env.step(actions))
-            assert_same(expected.render(), env.render())
-            assert_same(dict(expected.metadata), dict(env.metadata))
+            assert_same(
+                (expected.render(), {**expected.metadata}), (env.render(), {**env.metadata})
+            )
             config = {"name": "swarm", "gains": [0.5, 2.0], "limits": {"speed": 1}}
-            assert_same(config, env.hub_config)
-            assert env.initialized is False
+            assert_same((config, False), (env.hub_config, env.initialized))
             assert env.initialize(friction=0.25) == 0.25
             assert (env.initialized, env.friction) == (True, 0.25)
             assert not hasattr(env, "no_such_thing")
@@ -330,12 +327,10 @@ class TestWhatGoesWrong:
 
     def test_an_interpreter_without_our_packages_is_refused(self, tmp_path: Path) -> None:
         """The text says what to install there, and nothing crashed: there is no bundle."""
-        crashes = tmp_path / "crashes"
         venv.create(tmp_path / "bare", with_pip=False)
-        python = str(tmp_path / "bare" / "bin" / "python")
-        options = {"python": python, "policy": {"crash_folder": str(crashes)}}
+        python, crashes = str(tmp_path / "bare" / "bin" / "python"), tmp_path / "crashes"
         with pytest.raises(DependencyError, match="which the worker needs; install") as caught:
-            make_env(sample("cartpole"), **options)
+            make_env(sample("cartpole"), python=python, policy={"crash_folder": str(crashes)})
         assert str(caught.value).count(f"{python} has no ") == 1
         assert str(sample("cartpole")) in str(caught.value)
         assert code_for(caught.value) == Exit.LOAD
@@ -377,9 +372,8 @@ def test_a_known_task_is_all_that_its_jail_builds(tmp_path: Path, workers: int) 
     with make_env(folder, 2, workers > 1, num_workers=workers) as suites:
         env = suites["suite"]["b"]
         env.reset(seed=0)
-        built = env.call("built")
-    own = ["b/0", "b/1"]
-    assert list(built) == ([own, own] if workers == 1 else [own[:1], own[1:]])
+        own = ["b/0", "b/1"]
+        assert [*env.call("built")] == ([own, own] if workers == 1 else [own[:1], own[1:]])
 
 
 CHANGING = f"""{STILL}

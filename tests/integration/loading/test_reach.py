@@ -24,9 +24,6 @@ LEVEL = parser.parse_args().level
 class Told(Still):
     def argv(self):
         return list(sys.argv)
-
-def make_env(n_envs=1, use_async_envs=False):
-    return vector(Told, n_envs)
 """
 RUNS = f"""
 import os, socket, subprocess, sys, urllib.request
@@ -34,9 +31,6 @@ import os, socket, subprocess, sys, urllib.request
 class Runs(Still):
     def run(self, code):
         exec(code, globals())
-
-def make_env(n_envs=1, use_async_envs=False):
-    return vector(Runs, n_envs)
 """
 
 

@@ -31,8 +31,6 @@ def further():
     import sys, {name}
     return {{"seen.txt": repr(({name}.VERSION, [path for path in sys.path if "site-" in path]))}}
 """
-
-
 ASKS = """
 def get_requires_for_build_wheel(config_settings=None):
     return ["tool"]

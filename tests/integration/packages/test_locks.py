@@ -6,17 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from envhub_sandbox import make_env
-from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import LockDriftError, LockError, PolicyError
 from envhub_sandbox.extras.packages.resolution import resolutions
+from tests.support.command_line import document, envhub
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.repositories import importing, write_repository
 
-RUNNER = CliRunner()
 ENV = importing("not_here", version="not_here.VERSION")
 
 
@@ -33,10 +31,8 @@ def folder(packages: Index, tmp_path: Path) -> Path:
 
 
 def lock(folder: Path, *options: str, code: int = 0) -> dict[str, Any]:
-    arguments = ["lock", str(folder), "-o", str(path_of(folder)), "--json", *options]
-    done = RUNNER.invoke(app, arguments)
-    assert done.exit_code == code, done.output
-    return dict(json.loads(done.stdout)) if code == 0 else {"said": done.output}
+    done = envhub("lock", folder, "-o", path_of(folder), "--json", *options, code=code)
+    return json.loads(done.stdout) if code == 0 else {"said": done.stdout + done.stderr}
 
 
 def path_of(folder: Path) -> Path:
@@ -44,9 +40,8 @@ def path_of(folder: Path) -> Path:
 
 
 def verify(folder: Path, *options: str, code: int) -> str:
-    done = RUNNER.invoke(app, ["lock", "--check", str(path_of(folder)), str(folder), *options])
-    assert done.exit_code == code, done.output
-    return " ".join(done.output.split())
+    done = envhub("lock", "--check", path_of(folder), folder, *options, code=code)
+    return " ".join((done.stdout + done.stderr).split())
 
 
 def test_what_was_locked_runs_whatever_is_newer(packages: Index, folder: Path) -> None:
@@ -128,22 +123,20 @@ def test_other_arguments_say_something_else(folder: Path, monkeypatch: pytest.Mo
     with pytest.raises(LockError, match="envhub lock REF"):
         make_env(folder, lock=folder / "none.toml")
     inside = folder / "pylock.repo.toml"  # it would be one of the files
-    done = RUNNER.invoke(app, ["lock", str(folder), "-o", str(inside)])
-    assert (done.exit_code, inside.exists()) == (2, False)
-    assert "inside the folder that it locks" in " ".join(done.output.split())
+    told = envhub("lock", folder, "-o", inside, code=2).stderr
+    assert "inside the folder that it locks" in " ".join(told.split())
+    assert not inside.exists()
     path_of(folder).unlink()
     monkeypatch.chdir(folder)  # beside it, not inside
-    assert RUNNER.invoke(app, ["lock", ".", "--no-spaces"]).exit_code == 0
+    envhub("lock", ".", "--no-spaces", code=0)
     assert path_of(folder).exists()
 
 
 def test_what_a_lock_needs_is_fetched_ahead(packages: Index, folder: Path) -> None:
     lock(folder, "--no-spaces")
-    done = RUNNER.invoke(
-        app, ["inspect", "--download", str(folder), "--lock", str(path_of(folder)), "--json"]
-    )
-    assert "not-here==1.0" in json.loads(done.stdout)["environment"]["packages"]
+    locked = ("--lock", path_of(folder))
+    told = document("inspect", "--download", folder, *locked)
+    assert "not-here==1.0" in told["environment"]["packages"]
     asked = len(packages.asked)
-    done = RUNNER.invoke(app, ["inspect", str(folder), "--lock", str(path_of(folder)), "--json"])
-    assert done.exit_code == 0, done.output
+    document("inspect", folder, *locked)
     assert len(packages.asked) == asked

@@ -56,7 +56,6 @@ class Counted(gym.Env):
         self.count["render"] += 1
         return np.full((4, 4, 3), self.steps + self.count["render"], np.uint8)
 
-
 def make_env(n_envs=1, use_async_envs=False, mode="NextStep"):
     fns = [lambda i=i: Counted(3 + 2 * i + i % 2) for i in range(n_envs)]
     kind = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv

@@ -22,7 +22,6 @@ _ENV = '''
 import gymnasium as gym
 import numpy as np
 
-
 class Drawing(gym.Env):
     """Draws in reset, in step and in render."""
 
@@ -52,7 +51,6 @@ class Drawing(gym.Env):
     def get_action_meanings(self):
         return ["NOOP", "FIRE", "FAIL"]
 
-
 class Own(gym.vector.VectorEnv):
     """A vector environment with one generator, which is Gymnasium's."""
 
@@ -75,7 +73,6 @@ class Own(gym.vector.VectorEnv):
     def step(self, actions):
         no = np.zeros(self.num_envs, bool)
         return self._seen(), self.np_random.random(self.num_envs), no, no, {}
-
 
 def make_env(n_envs=1, use_async_envs=False, own=False):
     if own:

@@ -5,6 +5,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -38,15 +39,13 @@ Call = Callable[[], object]
 
 
 def kill(env: Any, worker: int) -> None:
-    part = inside.parts(env)[worker]
-    for pid in inside.part_pids(part):
+    for pid in inside.part_pids(inside.parts(env)[worker]):
         os.kill(pid, signal.SIGKILL)
 
 
 def is_waited_for(env: Any, worker: int) -> bool:
     lock = inside.use_lock_of(inside.parts(env)[worker])
-    free = lock.acquire(blocking=False)
-    if free:
+    if free := lock.acquire(blocking=False):
         lock.release()
     return not free
 
@@ -152,23 +151,14 @@ def test_a_step_may_take_too_long(gates: Gates) -> None:
 def test_close_ends_a_wait(gates: Gates) -> None:
     env = gates.env(3)
     send(env, 1, 2, ids=[0, 2])
-    heard: list[BaseException] = []
-
-    def wait() -> None:
-        try:
-            env.recv(2)
-        except BaseException as error:
-            heard.append(error)
-
-    thread = threading.Thread(target=wait)
-    thread.start()
-    assert eventually(lambda: is_waited_for(env, 2))
-    env.close()
-    thread.join(60)
-    assert [type(error) for error in heard] == [ClosedEnvironmentError]
-    assert "`SandboxVectorEnv`" in str(heard[0]), "as after it"
-    assert all(part.lifecycle.state is State.CLOSED for part in inside.parts(env))
-    assert all(part.lease.loaded is None for part in inside.parts(env))
+    with ThreadPoolExecutor(1) as threads:
+        waiting = threads.submit(env.recv, 2)
+        assert eventually(lambda: is_waited_for(env, 2))
+        env.close()
+        with pytest.raises(ClosedEnvironmentError, match="`SandboxVectorEnv`"):  # as after it
+            waiting.result(60)
+    for part in inside.parts(env):
+        assert (part.lifecycle.state, part.lease.loaded) == (State.CLOSED, None)
 
 
 @lanes
@@ -194,16 +184,14 @@ def test_a_timeout_ends_the_wait_for_another_threads_recv(gates: Gates) -> None:
     """Whose own goes on."""
     env = gates.env(2)
     send(env, 1, 1)
-    heard: list[Any] = []
-    thread = threading.Thread(target=lambda: heard.append(env.recv(2)))
-    thread.start()
-    assert eventually(lambda: is_waited_for(env, 0))
-    with pytest.raises(WorkerTimeoutError, match=r"ready after 0\.01 s") as late:
-        env.recv(2, timeout=0.01)
-    assert (late.value.request, late.value.timeout_s, heard) == ("recv", 0.01, [])
-    gates.open(1)
-    thread.join(60)
-    assert ids(*heard) == [0, 1]
+    with ThreadPoolExecutor(1) as threads:
+        own = threads.submit(env.recv, 2)
+        assert eventually(lambda: is_waited_for(env, 0))
+        with pytest.raises(WorkerTimeoutError, match=r"ready after 0\.01 s") as late:
+            env.recv(2, timeout=0.01)
+        assert (late.value.request, late.value.timeout_s, own.done()) == ("recv", 0.01, False)
+        gates.open(1)
+        assert ids(own.result(60)) == [0, 1]
 
 
 @lanes
@@ -238,8 +226,8 @@ class Loop:
 
     def __init__(self, env: Any, gates: Gates, first: int, ahead: int) -> None:
         self.env, self._gates, self._first, self._ahead = env, gates, first, ahead
-        self.sent: dict[int, list[int]] = {0: [], 1: []}
-        self.got: dict[int, list[int]] = {0: [], 1: []}
+        self.sent: list[list[int]] = [[], []]
+        self.got: list[list[int]] = [[], []]
 
     def receive(self) -> None:
         received = self.env.recv(1)
@@ -253,7 +241,7 @@ class Loop:
                 self.sent[index].append(number)
                 self._gates.open(number)
                 send(self.env, number, ids=[index])
-        while sum(map(len, self.got.values())) < 2 * self._ahead:
+        while sum(map(len, self.got)) < 2 * self._ahead:
             self.receive()
 
 

@@ -30,7 +30,6 @@ import numpy as np
 LOG = []
 SHARED = {"steps": 0}
 
-
 class Scene(gym.Env):
     """Each step gives one number, which depends on what its kind says."""
 
@@ -63,39 +62,31 @@ class Scene(gym.Env):
         info = {"t": self.t, "object": object(), "clock": time.perf_counter()}
         return np.array([draw * self.gain]), float(draw), self.t == 5, False, info
 
-
 def plain(scene):
     return scene.np_random.random()
 
-
 def unseeded(scene):
     return plain(scene) + scene.own.random() + np.random.default_rng().random()
-
 
 def counted(scene):
     Scene.total = getattr(Scene, "total", 0) + 1
     return plain(scene)
 
-
 def logged(scene):
     LOG.append(scene.t)
     return len(LOG)
-
 
 def exported(scene):
     last = os.environ.get("SCENE", scene.number)
     os.environ["SCENE"] = str(scene.number)
     return float(last)
 
-
 def located(scene):
     return int(os.path.basename(os.getcwd()))
-
 
 def closed_over(scene):
     SHARED["steps"] += 1
     return SHARED["steps"]
-
 
 SEEDS = {"numpy": np.random.seed, "random": random.seed}
 VALUES = {
@@ -109,7 +100,6 @@ VALUES = {
     "directory": located,
     "closed over": closed_over,
 }
-
 
 def make_env(n_envs=1, use_async_envs=False, kind="plain", mode="NEXT_STEP"):
     cls = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv

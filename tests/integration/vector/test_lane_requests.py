@@ -23,7 +23,6 @@ from tests.support.started import started
 REPOSITORY = '''
 LARGE = 2 * 65536
 
-
 class Talker(Still):
     """Counts what it is asked, says so in its infos, and some of these are large."""
 
@@ -59,13 +58,10 @@ class Talker(Still):
 
         os.kill(os.getpid(), 40)
 
-
 def make_env(n_envs=1, use_async_envs=False):
     cls = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
     return cls([Talker] * n_envs)
 '''
-
-
 assert slabs.INFO_BYTES == 65536, "what is large has changed"
 
 

@@ -24,7 +24,6 @@ import time
 
 ALL = []
 
-
 class Told(Still):
     """Some attributes stay, some change with each step, some with each episode."""
 
@@ -76,23 +75,18 @@ class Told(Still):
         for one in ALL:
             one.task = "another"
 
-
 class Live(gym.vector.SyncVectorEnv):
     """Is built by itself, so that all tasks share a process."""
 
     def step(self, actions):
         return super().step(actions)
-
-
-def make_env(n_envs=1, use_async_envs=False):
-    return vector(Told, n_envs)
 '''
 REPOSITORY = STILL + _TOLD
-SUITE = REPOSITORY.replace(
-    "    return vector(Told, n_envs)\n",
-    "    kinds = (gym.vector.SyncVectorEnv, gym.vector.SyncVectorEnv, Live)\n"
-    "    return {'suite': {task: kind([Told] * n_envs) for task, kind in enumerate(kinds)}}\n",
-)
+SUITE = f"""{REPOSITORY}
+def make_env(n_envs=1, use_async_envs=False):
+    kinds = (gym.vector.SyncVectorEnv, gym.vector.SyncVectorEnv, Live)
+    return {{"suite": {{task: kind([Told] * n_envs) for task, kind in enumerate(kinds)}}}}
+"""
 READ = ("task", "kind", "steps", "episodes", "count", "asked", "absent", "late")
 WAYS = [
     {"policy": {"lane": "auto"}, "num_workers": 1},

@@ -78,7 +78,6 @@ def test_the_life_of_two_clients_can_be_read(tmp_path: Path) -> None:
     assert all(one["level"] in LEVELS and one["time"].endswith("Z") for one in found)
     assert [one["time"] for one in found] == sorted(one["time"] for one in found)
     assert {one["client"] for one in of(server, "client_connected")} == set(names)
-
     [opened] = of(server, "jail_opened", client="alice")
     assert opened["environment"].endswith("counter:env.py")
     assert re.fullmatch("[0-9a-f]{64}", opened["snapshot"])
@@ -89,7 +88,6 @@ def test_the_life_of_two_clients_can_be_read(tmp_path: Path) -> None:
     assert closed["bytes_in"] > 0 < closed["bytes_out"]
     [upload] = of(server, "upload", client="alice", snapshot=opened["snapshot"])
     assert upload["bytes"] > 0
-
     busy = of(server, "refused", client="alice", error="ServerBusyError")
     assert {(one["quota"], one["used"], one["limit"]) for one in busy} == {("jails", 1, 1)}
     [died] = of(server, "jail_died", client="bob the builder")

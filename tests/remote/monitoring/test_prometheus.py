@@ -26,7 +26,6 @@ pytestmark = pytest.mark.skipif(
     reason="there is no prometheus here",
 )
 pytest.importorskip("prometheus_client", reason="prometheus-client is missing")
-
 _SCRAPES = """
 global: {{scrape_interval: 1s}}
 scrape_configs:

@@ -18,7 +18,6 @@ DOCUMENTS = tuple(
     )
     for path in sorted(CHECKOUT.glob(pattern))
 )
-
 RUN = "executed with the others of its document"
 OWN = "executed by a test of its own"
 HELD = "not executed: each command, option and script in it is one that there is"

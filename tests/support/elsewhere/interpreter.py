@@ -49,7 +49,6 @@ _BEFORE = """
     rich.console rich.progress rich.table typer.rich_utils typer.testing uv yaml zmq
     zmq.utils.monitor shellingham rich.live rich.status pyproject_hooks psutil lz4.frame
 """
-
 _LINUX_ALONE = {
     "os": """
         memfd_create MFD_CLOEXEC MFD_ALLOW_SEALING pidfd_open P_PIDFD waitid eventfd

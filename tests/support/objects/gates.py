@@ -13,7 +13,6 @@ _REPOSITORY = """
 import os
 import time
 
-
 class Gated(Still):
     \"\"\"A step waits until there is a file of this name; its infos may be large.
 
@@ -49,7 +48,6 @@ class Gated(Still):
         if what == 3:
             os._exit(1)
         return self.seen(), float(gate), False, False, {"said": "x" * (200_000 if what else 1)}
-
 
 def make_env(n_envs=1, use_async_envs=False, autoreset_mode="NextStep"):
     cls = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv

@@ -110,7 +110,6 @@ def _objects() -> Any:
 
 Point = collections.namedtuple("Point", "x y")
 STRUCTURED = np.dtype([("a", "<i4"), ("b", "<f8", (2,))])
-
 PLAIN: dict[str, Any] = {
     "None": None,
     "bool": True,
@@ -150,7 +149,6 @@ PLAIN: dict[str, Any] = {
     "0-d object": np.array({"a": 1}, object),
 }
 """What the wire has a form for."""
-
 PICKLED: dict[str, Any] = {
     "Enum": Level.HIGH,
     "IntEnum": Code.A,
@@ -217,7 +215,6 @@ PICKLED: dict[str, Any] = {
     "attrgetter": operator.attrgetter("a.b"),
 }
 """What it has none for, or one that would change it."""
-
 CALLABLE: dict[str, Callable[..., Any]] = {
     "function": half,
     "lambda": lambda value: value + 1,
@@ -226,6 +223,5 @@ CALLABLE: dict[str, Callable[..., Any]] = {
     "own class": OwnInt,
 }
 """The same for what is called: it gives the same for 3."""
-
 CYCLIC = _cyclic()
 """A list that holds itself."""
