@@ -1,9 +1,7 @@
 """``python -m tests.distributions``: both distributions as an index would have them.
-
 Each is built as a source distribution and, out of that, as a wheel; checked by twine; and installed
 into an empty environment, where the README's first command has to play from what is installed
-alone. Needs the way to an index.
-"""
+alone. Needs the way to an index."""
 
 import os
 import re

@@ -1,8 +1,6 @@
 """Fixtures of the attacks, and the table that a run of them writes.
-
 ``ENVHUB_ATTACK_TABLE=attacks.md pytest tests/attacks`` writes this user's columns of the
-table; run it as root and as a plain user for all of them.
-"""
+table; run it as root and as a plain user for all of them."""
 
 import shutil
 import tempfile

@@ -1,7 +1,5 @@
 """The attacks that are not stopped, where, and why. Asserted: a change is noticed.
-
-``docs/threat-model.md`` lists every one of them; a test compares the two.
-"""
+``docs/threat-model.md`` lists every one of them; a test compares the two."""
 
 from collections.abc import Collection
 

@@ -1,10 +1,8 @@
 """Runs one payload twice, outside and inside of a sandbox, and keeps what became of it.
-
 A payload is a function in ``hostile/payloads``. What it says of itself is only a detail: whether
 an attack succeeded is decided by a function of the test that looks from outside, at a listener, a
 file, a victim, the process table, or (where something is to be stolen) for a random token in what
-came back through the channels that the repository has anyway.
-"""
+came back through the channels that the repository has anyway."""
 
 import contextlib
 import json

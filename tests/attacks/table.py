@@ -1,5 +1,4 @@
 """The table of attacks as a page: columns for a user and root under each profile.
-
 A run knows one user's columns; those of the other one are taken over from the page as it is.
 ``python -m tests.attacks.table attacks.md`` writes the summary of such a page, ``docs/attacks.md``.
 """

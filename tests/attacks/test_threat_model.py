@@ -45,8 +45,7 @@ def test_threat_model_lists_what_a_jail_holds_open() -> None:
 
 def test_table_agrees_with_the_expectations() -> None:
     """What the table of attacks calls not stopped is expected, or only measured; and each family of
-    attacks is in it.
-    """
+    attacks is in it."""
     above, _, below = (DOCS / "attacks.md").read_text().partition("## Not stopped")
     sources = [path.read_text() for path in Path(__file__).parent.rglob("*.py")]
     families = {name for text in sources for name in re.findall(r'^FAMILY = "(.+)"$', text, re.M)}

@@ -1,8 +1,6 @@
 """What Gymnasium's own tests ask of a vector environment, asked of ours; its releases ship none.
-
 Written anew after ``tests/vector`` of its repository. Each test runs on ``SyncVectorEnv`` in this
-process, so that it says what is so there, and on each way to have the same in a sandbox.
-"""
+process, so that it says what is so there, and on each way to have the same in a sandbox."""
 
 import multiprocessing
 import time

@@ -1,8 +1,6 @@
 """Infos that come from several shards are what one vector environment would have made of them.
-
 Except where sub-environments disagree about a key's dtype: Gymnasium casts to the first one's, and
-each shard has a first one of its own.
-"""
+each shard has a first one of its own."""
 
 import itertools
 import warnings

@@ -1,7 +1,5 @@
 """Repositories on ``gym``, Gymnasium's predecessor, compared with the same stepped by hand.
-
-The oracle is a plain process that has the same packages, and uses ``gym`` as its users did.
-"""
+The oracle is a plain process that has the same packages, and uses ``gym`` as its users did."""
 
 import json
 import subprocess

@@ -1,8 +1,6 @@
 """Repositories on releases of Gymnasium that are older than the client's, and another numpy.
-
 The oracle is the client's own Gymnasium, in the mode that the older release had: what a repository
-on 0.29 gives is what the same repository would give here with ``SAME_STEP``.
-"""
+on 0.29 gives is what the same repository would give here with ``SAME_STEP``."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

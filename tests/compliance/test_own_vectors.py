@@ -470,9 +470,7 @@ def test_an_own_vector_is_stepped_in_shared_memory_and_returns_the_same(
     restart: str,
 ) -> None:
     """Whatever it returns, also where that does not fit, or changes its form; and its errors.
-
-    Also where several share a process, and where a process that dies is replaced.
-    """
+    Also where several share a process, and where a process that dies is replaced."""
     pytest.importorskip("torch")
     read = Mock(side_effect=StepColumns.read)
     folder = write_repository(tmp_path, _PLAIN)

@@ -1,9 +1,7 @@
 """An environment that fills the same mappings and arrays again and again.
-
 What arrives is what the repository's own vector environment gives, whose ``SyncVectorEnv`` takes
 infos when it has them, and refers to a ``final_obs``; and the end of a single environment's episode
-is the end.
-"""
+is the end."""
 
 import contextlib
 import importlib.util

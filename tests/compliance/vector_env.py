@@ -1,8 +1,6 @@
 """The compliance suite: what it means to be the same environment as the one in process.
-
 Inherit from ``VectorEnvCompliance``, name a sample repository and its cases, and every test runs
-on each of them. ``SyncVectorEnv`` in this process is the oracle, for ``use_async_envs`` too.
-"""
+on each of them. ``SyncVectorEnv`` in this process is the oracle, for ``use_async_envs`` too."""
 
 import contextlib
 import itertools

@@ -1,9 +1,7 @@
 """What the tests of containers share: an engine with the image, or a reason to skip.
-
 ``ENVHUB_TEST_IMAGE`` names the image; ``envhub-worker`` by default, which must be built from this
 checkout: ``docker build -t envhub-worker .``. With
-``ENVHUB_CONTAINER_TABLE=docs/attacks-containers.md`` a run as root writes the table of attacks.
-"""
+``ENVHUB_CONTAINER_TABLE=docs/attacks-containers.md`` a run as root writes the table of attacks."""
 
 import os
 import shutil

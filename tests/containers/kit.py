@@ -61,9 +61,7 @@ def pids_in(engine: Engine, container: str) -> list[int]:
 
 class Walls(Arena):
     """Attacks in a container: inside of a jail in it, or next to the server, without any jail.
-
-    The second kind shows what the container's own walls hold, should a jail be broken.
-    """
+    The second kind shows what the container's own walls hold, should a jail be broken."""
 
     def __init__(self, place: str, engine: Engine) -> None:
         super().__init__(place, "Containers")

@@ -1,8 +1,6 @@
 """The attacks that a container is for, each with a control that succeeds without one.
-
 In a jail with namespaces, in a jail without, and in no jail at all, next to the server: the last
-one shows what the container's own walls hold.
-"""
+one shows what the container's own walls hold."""
 
 import json
 import os

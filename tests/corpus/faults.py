@@ -1,9 +1,7 @@
 """Repositories with one fault each, and the check that has to find it.
-
 Those of seeds, types, rewards and renderings are what people report to Gymnasium, Stable-Baselines3
 and LeRobot (Gymnasium 899, 914, 1084, 1179, 1207, 1445; gym 980, 1420; Stable-Baselines3 1132,
-1151; gym-pusht 27; RLBench 48; ManiSkill 320).
-"""
+1151; gym-pusht 27; RLBench 48; ManiSkill 320)."""
 
 import io
 import py_compile

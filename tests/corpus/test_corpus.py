@@ -1,8 +1,6 @@
 """``envhub check`` finds the one fault of each repository, and nothing in the honest ones.
-
 What stands with an entry is in the table of ``docs/checks.md``; here each third honest one is
-judged, and of the faults that one check finds the first. ``ENVHUB_TEST_LONG=1`` judges all.
-"""
+judged, and of the faults that one check finds the first. ``ENVHUB_TEST_LONG=1`` judges all."""
 
 import os
 from collections import Counter

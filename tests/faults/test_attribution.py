@@ -1,9 +1,7 @@
 """No result is ever attributed to another request, and the lifecycle's table is what happens.
-
 A state machine drives a real worker through timeouts, late replies, deaths, interrupts and
 closes. Every request carries a token of its own and every answer repeats it; but for the rows of
-what has died and comes back, under ``restart="transparent"``, which say so.
-"""
+what has died and comes back, under ``restart="transparent"``, which say so."""
 
 import itertools
 import os

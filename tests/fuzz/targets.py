@@ -1,8 +1,6 @@
 """What is lied to. A target takes one example's dice and says whether the lie was taken.
-
 It raises ``WrongError`` where a lie did harm; errors of this project are refusals, and anything
-else is what must never come out.
-"""
+else is what must never come out."""
 
 import random
 import re

@@ -1,8 +1,6 @@
 """What real workers say: recorded from runs of the samples, over both lanes.
-
 ``python -m tests.fuzz.traffic FILE`` makes the recording: the messages as they came in, each of
-another outline, as a list of frames.
-"""
+another outline, as a list of frames."""
 
 import pickle
 import sys

@@ -1,9 +1,7 @@
 """A real Hub on loopback: git repositories of our own, served by olah to the real client.
-
 olah serves branches without ``/``, tags, short and full commits, models, spaces, datasets and
 LFS. It answers everything that it does not find with 401 RepoNotFound; errors of other kinds
-are ``stub_hub``'s part.
-"""
+are ``stub_hub``'s part."""
 
 import hashlib
 import re

@@ -1,8 +1,6 @@
 """A Hub that lies and fails on demand: a small HTTP server that speaks the Hub's API.
-
 It serves ``StubRepository`` objects truthfully until a test plants a lie in one, or a fault that
-answers the requests it matches instead.
-"""
+answers the requests it matches instead."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
 """Each benchmark is started once, as short as can be: it runs, and says nothing about speed.
-
 ``reach`` is a step of CI; ``suites`` imports torch in each of its interpreters, and ``remote``
-takes longer than what it shows: they are left out.
-"""
+takes longer than what it shows: they are left out."""
 
 import re
 import subprocess

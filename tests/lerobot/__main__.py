@@ -1,11 +1,9 @@
 """``python -m tests.lerobot [VERSION...]``: all that is tested with LeRobot, each in its own.
-
 A version is a release, or ``main``: the newest commit of a clone of LeRobot's repository, which
 ``--source`` or ``$ENVHUB_LEROBOT_SOURCE`` names (a bare one will do). LeRobot's own tests of
 environments lie there as well; without it they are not run, nor is ``main``. An interpreter of its
 own for each version, with what that version asks for, and the plugin distribution installed from
-its folder. A torch without CUDA is taken from ``$PIP_FIND_LINKS``.
-"""
+its folder. A torch without CUDA is taken from ``$PIP_FIND_LINKS``."""
 
 import argparse
 import os

@@ -10,8 +10,7 @@ from tests.lerobot.repositories import ARENA, REACH
 
 def test_an_evaluation_is_the_same(olah: OlahServer, tmp_path: Path) -> None:
     """Returns, successes and the bytes of videos, by each way into the sandbox; by the commands of
-    the pages, with the sizes of a test added.
-    """
+    the pages, with the sizes of a test added."""
     commit = olah.repository("robots/evaluated").commit({"env.py": REACH})
     olah.repository("nvidia/isaaclab-arena-envs").commit({"env.py": ARENA})
     commands = json.dumps(written("robots/evaluated")[0])

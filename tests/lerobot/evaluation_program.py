@@ -1,7 +1,5 @@
 """``lerobot-eval`` in this process and in the sandbox, by LeRobot's own ``main``; prints both.
-
-To be run in an interpreter that has all of LeRobot, by ``kit.run``.
-"""
+To be run in an interpreter that has all of LeRobot, by ``kit.run``."""
 
 import hashlib
 import json
@@ -102,8 +100,7 @@ def saved(folder: str, cfg: Any) -> str:
 
 def by_the_pages() -> dict[str, Any]:
     """The commands that our pages write; of Isaac Lab Arena, of which LeRobot has a configuration,
-    also what LeRobot itself makes of the same repository.
-    """
+    also what LeRobot itself makes of the same repository."""
     from envhub_sandbox.integrations import lerobot_eval as ours
 
     lines = [words for program, *words in COMMANDS if program == "lerobot-eval"]

@@ -1,7 +1,5 @@
 """What LeRobot's pages do, with LeRobot's own functions after ``install()``; prints findings.
-
-To be run in an interpreter that has LeRobot, by ``kit.run``.
-"""
+To be run in an interpreter that has LeRobot, by ``kit.run``."""
 
 import json
 import os
@@ -130,8 +128,7 @@ def described() -> None:
 
 def processed() -> None:
     """What a policy is given of observations in the forms of LIBERO and of Isaac Lab Arena: what
-    LeRobot's own configurations of these make of them, in the shapes of the features.
-    """
+    LeRobot's own configurations of these make of them, in the shapes of the features."""
     arena = {"state_keys": "robot_joint_pos,fingers", "camera_keys": "robot_pov_cam_rgb"}
     own = {name: LiberoEnv().get_env_processors()[0] for name in ("libero", "declared")}
     own["arena"] = IsaaclabArenaEnv(**arena).get_env_processors()[0]

@@ -1,5 +1,4 @@
 """LeRobot's own tests of environments, in this process and with ours: ``python -m tests.lerobot``.
-
 They lie in its repository and in no wheel, so that they run where ``--source`` names a clone of it.
 """
 

@@ -11,8 +11,7 @@ from tests.lerobot.repositories import REACH
 
 def test_a_training_is_the_same(olah: OlahServer, tmp_path: Path) -> None:
     """To its end: what it evaluates to, the bytes of videos, and the weights of checkpoints; by the
-    command of the page, with the sizes of a test added.
-    """
+    command of the page, with the sizes of a test added."""
     commit = olah.repository("robots/trained").commit({"env.py": REACH})
     [command] = [
         words for program, *words in written("robots/trained")[0] if program == "lerobot-train"

@@ -1,7 +1,5 @@
 """``lerobot-train`` by its ``main``, evaluating in this process and in the sandbox; prints both.
-
-To be run in an interpreter that has all of LeRobot, by ``kit.run``.
-"""
+To be run in an interpreter that has all of LeRobot, by ``kit.run``."""
 
 import hashlib
 import json

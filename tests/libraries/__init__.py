@@ -1,10 +1,8 @@
 """``python -m tests.libraries [LIBRARY...]``: guides for libraries that CI has no room for.
-
 Each in an environment of its own, with the newest releases that go together. The example that the
 guide shows is run as it is. A library without one has a program in this folder, which plays the
 same environment without a sandbox and with it, and fails unless the results are equal. A torch
-without CUDA is taken from ``$PIP_FIND_LINKS``.
-"""
+without CUDA is taken from ``$PIP_FIND_LINKS``."""
 
 import argparse
 import os

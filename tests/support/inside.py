@@ -1,11 +1,9 @@
 """What tests and benchmarks see of the inside: the one place that knows private names.
-
 A test asks for what it needs by the name of what it gets: ``inside.jail(env)``, and not by where
 that lies today. When the packages are arranged anew this file is changed, and no test is. So a
 test names nothing that starts with an underscore; ruff finds who does. What is missing
 here is added here: a function, or a *spot*, which is an owner and a name, for
-``monkeypatch.setattr(*inside.ending(env), interrupted)``.
-"""
+``monkeypatch.setattr(*inside.ending(env), interrupted)``."""
 
 import contextlib
 import os
@@ -174,8 +172,7 @@ def asks_patiently(env: Any) -> None:
 
 def written_later(lane: Any, word: int, value: int) -> Callable[[], bool]:
     """``lane.answered`` of a lane in shared memory whose jail writes one word into each reply as
-    soon as that has said yes.
-    """
+    soon as that has said yes."""
     answered = lane.answered
 
     def and_changed() -> bool:

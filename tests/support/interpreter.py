@@ -1,8 +1,6 @@
 """Who may read the interpreter of the tests, and so which profiles can be tested with it.
-
 Root's jails run as another user. With a private root they are shown the interpreter; without one
-that user needs the host's permission to read it, which one below ``/root`` does not give.
-"""
+that user needs the host's permission to read it, which one below ``/root`` does not give."""
 
 import os
 import stat

@@ -1,5 +1,4 @@
 """What ``lerobot-eval`` does to vector environments, without LeRobot.
-
 Followed, call by call: ``lerobot.scripts.lerobot_eval`` (``rollout``, ``eval_policy``,
 ``eval_policy_all``), ``lerobot.envs.utils`` (``check_env_attributes_and_types``, ``close_envs``).
 """

@@ -1,8 +1,6 @@
 """Where the sample repositories are, and how to run one in this process as the reference.
-
 Importing them here is allowed: they are ours. The environments that come out are what an
-in-process user of Gymnasium would have, and so the oracle for the sandbox.
-"""
+in-process user of Gymnasium would have, and so the oracle for the sandbox."""
 
 import importlib
 import importlib.util

@@ -23,8 +23,7 @@ def started(*arguments: Any, seed: int | None = 1, **options: Any) -> Iterator[A
 @contextmanager
 def nothing_more_held() -> Iterator[Callable[[], bool]]:
     """Whether nothing is held beyond what one environment does, which runs meanwhile: uses of its
-    server and jails in it, and descriptors of ours.
-    """
+    server and jails in it, and descriptors of ours."""
     with started(sample("echo"), n_envs=2) as env:
 
         def held() -> tuple[int, int, int]:

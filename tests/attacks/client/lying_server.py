@@ -1,9 +1,7 @@
 """A worker server that speaks the wire and lies; a sandbox that leads the client to it.
-
 It answers honestly, for a repository with one environment, except for the requests that a test
 has a lie for. Runs in a thread of the test: what it allocates is small, so that memory that the
-client is made to take shows.
-"""
+client is made to take shows."""
 
 import contextlib
 import os

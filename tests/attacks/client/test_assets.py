@@ -1,5 +1,4 @@
 """Cards and asset repositories that lie: what the client fetches for them, and shows to a jail.
-
 A control follows the card as a loader without judgement would, with YAML's and huggingface_hub's
 own functions. Judged at the Hub, which writes down who asked for what, and by what a jail can read.
 """
@@ -151,8 +150,7 @@ def test_what_the_callers_login_has_brought_is_no_strangers(
     stub_hub: StubHub, make: Make, tmp_path: Path, kind: str
 ) -> None:
     """The store has the commit, and so needs no request; for a card and a lock the Hub is asked all
-    the same, whether everybody gets it. The control is the caller's own word.
-    """
+    the same, whether everybody gets it. The control is the caller's own word."""
     mine = stub_hub.add("me/mine", {"x": "secret"})
     mine.token, mine.gated = ("hf_mine", False) if kind == "private" else ("", True)
     asset = f"me/mine@{COMMIT}"

@@ -1,8 +1,6 @@
 """A hostile worker that describes spaces, specs and generators in its answers.
-
 The controls make of the same fields what they ask for: there memory is asked for without end, a
-command runs, and what one message may cost is not what its parts cost one by one.
-"""
+command runs, and what one message may cost is not what its parts cost one by one."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,8 +1,6 @@
 """One server of a fleet is hostile: its answers are refused, and no other's rows change.
-
 It may end what it serves, which costs the caller an error. The rows of the others are as they were,
-and their workers go on.
-"""
+and their workers go on."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

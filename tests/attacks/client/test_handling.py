@@ -1,8 +1,6 @@
 """Whatever the handling of a worker's input raises: one error of ours, and one jail given up.
-
 What is injected here stands for what nobody has thought of. The control is the same code without
-what stands around it: there the injected error comes out as it is.
-"""
+what stands around it: there the injected error comes out as it is."""
 
 import signal
 import struct

@@ -1,8 +1,6 @@
 """A hostile runner in a real jail: the repository replaces our code next to it, and lies.
-
 Jail and repository share a process, so that nothing our code does there can be relied on. What
-counts is what the server and the client make of it: the same under every profile.
-"""
+counts is what the server and the client make of it: the same under every profile."""
 
 import os
 import pickle

@@ -1,8 +1,6 @@
 """A hostile worker against the client: whatever it answers, the client stays whole.
-
 A lie ends in one of this project's errors, executes nothing, and costs bounded memory and time;
-afterwards the client closes the environment and works on with others.
-"""
+afterwards the client closes the environment and works on with others."""
 
 import contextlib
 import os

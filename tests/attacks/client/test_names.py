@@ -1,9 +1,7 @@
 """A hostile worker against what programs do with any object: copy, print, display, convert, make.
-
 Libraries call methods that the caller never wrote. The controls do the same with a proxy that
 serves whatever a manifest lists, and with what a worker sent unchecked: there the attack works.
-What counts is what the worker heard, which memory was read or written, and which files appeared.
-"""
+What counts is what the worker heard, which memory was read or written, and which files appeared."""
 
 import contextlib
 import copy

@@ -1,8 +1,6 @@
 """A hostile worker among others: ready always, or never, or twice. The others' results come.
-
 The jail of one sub-environment replaces our code in its process. Control: a step, which waits for
-all, is held up by the same worker, so it does what it is meant to.
-"""
+all, is held up by the same worker, so it does what it is meant to."""
 
 import time
 from collections.abc import Iterator
@@ -309,8 +307,7 @@ def test_an_answer_that_is_taken_back_holds_nobody_up(
     strict: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, word: str
 ) -> None:
     """It was there, and a jail writes its slab whenever it likes: as if there were none yet, or as
-    if there were more elsewhere, which never comes.
-    """
+    if there were more elsewhere, which never comes."""
     value = {"SEQUENCE": 0, "OUTCOME": slabs.FETCH}[word]
     with among(strict, liar(tmp_path, "silent elsewhere"), "auto") as suites:
         found = Among(suites.env)

@@ -1,7 +1,5 @@
 """Steps that a server takes: what it and the jail put into the slabs, in any size and of any kind.
-
-The server is one that lies. The control is the same server, which is honest once.
-"""
+The server is one that lies. The control is the same server, which is honest once."""
 
 import os
 import struct

@@ -1,8 +1,6 @@
 """A hostile worker against what the caller is given: specs, generators, seeds, infos.
-
 Each is used as programs use it. The controls take what the worker sent as it is: there a command
-runs, a process crashes, and memory becomes random numbers.
-"""
+runs, a process crashes, and memory becomes random numbers."""
 
 import copy
 import json

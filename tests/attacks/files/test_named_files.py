@@ -1,8 +1,6 @@
 """A file that is named alone, beside what is its user's: what its code gets of that folder.
-
 The control is Python on the same file, where it lies. Whether something was stolen says a random
-token in what comes back.
-"""
+token in what comes back."""
 
 import json
 import subprocess

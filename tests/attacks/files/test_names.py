@@ -1,8 +1,6 @@
 """A repository whose names are others on Windows, or one on a file system without case.
-
 Each name is legal where a repository is made. The control lays the same files out as any program
-does, and another file than the listing's is written, or one outside of the folder.
-"""
+does, and another file than the listing's is written, or one outside of the folder."""
 
 import hashlib
 import json

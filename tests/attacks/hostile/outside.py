@@ -1,9 +1,7 @@
 """The control: runs one payload in a plain interpreter, next to nothing but the client.
-
 argv: name, arguments as JSON, alias. The first line of stdin is a secret that this process then
 holds in its memory, as a trainer that imports the repository would. Prints one line of JSON, and
-stays until stdin ends.
-"""
+stays until stdin ends."""
 
 import json
 import os

@@ -1,11 +1,9 @@
 """A host with GPUs that are none: ``python -m tests.attacks.kernel.gpu_host``, in its own mounts.
-
 argv: one JSON object: ``profile``, ``gpu``, and ``nodes`` (a path in /dev to what is read there),
 ``net`` (the name of a network device) and ``gpus`` (a render node's name to a PCI address). Runs
 ``reach_devices`` once in a plain process and once in a jail, and prints one line of JSON with what
 came of both: ``outside``, ``inside``, ``report``, ``mounts`` of the jail's process and ``refused``,
-what is said of a GPU that there is not.
-"""
+what is said of a GPU that there is not."""
 
 import json
 import os

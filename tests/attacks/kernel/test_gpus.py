@@ -1,8 +1,6 @@
 """A jail with one GPU reaches for the others, for displays, and for what /sys says of the host.
-
 There is no GPU here. The host is one whose nodes are files, in mounts that only it sees: whose
-words come back has been opened. Nothing in the sandbox knows the difference.
-"""
+words come back has been opened. Nothing in the sandbox knows the difference."""
 
 import json
 import os

@@ -1,8 +1,6 @@
 """A jail that was given a network: its own loopback device, or the host's network.
-
 Its own is nobody else's, neither the host's nor another jail's. The host's is TCP and UDP, and
-nothing besides: no other protocol, no socket file and no service of ours.
-"""
+nothing besides: no other protocol, no socket file and no service of ours."""
 
 import contextlib
 import socket

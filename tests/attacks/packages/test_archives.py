@@ -1,8 +1,6 @@
 """Archives that keep their reader: a header that leads back, a download that never ends.
-
 They are read in this process's stead by one that ends at a deadline. The controls read the same as
-one does without this project.
-"""
+one does without this project."""
 
 import contextlib
 import gzip

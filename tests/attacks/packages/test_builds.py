@@ -1,8 +1,6 @@
 """Sources that attack while they are built: they run in a jail, and give one wheel or nothing.
-
 The control builds the same sources as one does without this project: their backend is called in a
-plain interpreter.
-"""
+plain interpreter."""
 
 import subprocess
 import zipfile

@@ -1,7 +1,5 @@
 """What jails share is copied when it is written to: no change leaves the jail that makes it.
-
-Nothing here is saved by its mode: everybody may write to all of it.
-"""
+Nothing here is saved by its mode: everybody may write to all of it."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Hostile repositories of git, by reference: no program runs, nothing else is asked, no lie holds.
-
-The control is plain git with the same repository and the same user: there each of them succeeds.
-"""
+The control is plain git with the same repository and the same user: there each of them succeeds."""
 
 import contextlib
 import os

@@ -1,9 +1,7 @@
 """Packages that run code by themselves: while they are chosen, installed, or merely lie there.
-
 Each trap leaves a file in a folder that no jail can write to, so that the file says from outside
 whether it went off outside of one. The control springs the same trap with the same uv, or in an
-interpreter that has the same packages, as one does without this project.
-"""
+interpreter that has the same packages, as one does without this project."""
 
 import contextlib
 import shutil

@@ -1,7 +1,5 @@
 """A repository's own packages: nothing of them runs outside of a jail, whatever they are called.
-
-The control uses the same folder as anybody would: a virtual environment, or ``PYTHONPATH``.
-"""
+The control uses the same folder as anybody would: a virtual environment, or ``PYTHONPATH``."""
 
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 """Folders of packages with traps: code that would run before anybody asked for it, or for another.
-
 Each trap leaves a file in a folder that every user may write to, and so says where it ran: a jail
-cannot reach that folder, and whatever else runs it can.
-"""
+cannot reach that folder, and whatever else runs it can."""
 
 import contextlib
 import importlib.util

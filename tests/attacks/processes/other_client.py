@@ -1,9 +1,7 @@
 """Another client with a server of its own: ``python -m tests.attacks.processes.other_client``.
-
 argv: the user to be, a profile and a secret. Opens a jail of the hostile repository that holds the
 secret, and prints one JSON object: what ``be_victim`` says, the jail's process, and the folders of
-the server and the cache. For each line that it reads it prints how the jail is then.
-"""
+the server and the cache. For each line that it reads it prints how the jail is then."""
 
 import json
 import os

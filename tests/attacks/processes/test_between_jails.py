@@ -1,7 +1,5 @@
 """One jail against another one of the same server, of the same caller, while both are live.
-
-The control aims the same payload at an ordinary process of the caller's.
-"""
+The control aims the same payload at an ordinary process of the caller's."""
 
 import os
 from collections.abc import Iterator

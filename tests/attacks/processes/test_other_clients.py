@@ -1,8 +1,6 @@
 """One jail against another client's: its jail, its worker server, and what it keeps on disk.
-
 The other client is of the same user, or (started as root) of another one. Either has a server of
-its own. The controls aim the same payloads at a process and at files of the caller's.
-"""
+its own. The controls aim the same payloads at a process and at files of the caller's."""
 
 import json
 import os

@@ -1,9 +1,7 @@
 """A process of the client's user that attacks aim at; run as a script, and its end for tests.
-
 As a script it holds a secret in its memory, its environment, its command line and an unlinked
 file, permits everybody to trace it (as far as the kernel's rules allow that), counts the signals
-that reach it, and answers each line of stdin with its state.
-"""
+that reach it, and answers each line of stdin with its state."""
 
 import ctypes
 import json

@@ -1,10 +1,8 @@
 """Messages made to exhaust whoever decodes them, and a victim that decodes all of them.
-
 Run as ``python -m tests.attacks.protocol.decoder_bombs [plain]``. Prints a line of JSON for each:
 its name, what came of it, and by how much its memory grew at most. With ``plain`` the
 victim is msgpack itself instead of our decoder, and gets the first one. Address space and the CPU
-time for each are limited by the kernel.
-"""
+time for each are limited by the kernel."""
 
 import json
 import os

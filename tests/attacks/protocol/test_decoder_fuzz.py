@@ -1,9 +1,7 @@
 """The decoder against a peer that wants it to run code, hang, or eat all memory.
-
 Whatever comes, it either decodes or raises ``RemoteProtocolError``; it executes nothing, and
 stays within the memory and time of a message that is allowed. ``test_fuzz`` spoils what real
-workers say, descriptions of spaces among it.
-"""
+workers say, descriptions of spaces among it."""
 
 import json
 import os

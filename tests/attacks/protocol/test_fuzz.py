@@ -1,8 +1,6 @@
 """Lies made from what real workers have said: a bounded number here, longer by ``tests.fuzz``.
-
 The seed here is the same each time, so that who changes nothing breaks nothing. New lies are told
-by the command, which draws a seed and prints it. What fails says how to do it again.
-"""
+by the command, which draws a seed and prints it. What fails says how to do it again."""
 
 import pickle
 import subprocess

@@ -1,8 +1,6 @@
 """A jail holds the descriptors of the fast lane's slabs: what can it do to the client with them?
-
 The hostile side is another process with exactly those descriptors; the verdict is the client's
-own memory, and whether the client is still alive.
-"""
+own memory, and whether the client is still alive."""
 
 import mmap
 import os

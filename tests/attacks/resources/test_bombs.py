@@ -1,7 +1,5 @@
 """Taking more than the limits give: processes, memory, disk, processor time, output.
-
-The controls are tame: they take a little more than the limits of the jail, and no more.
-"""
+The controls are tame: they take a little more than the limits of the jail, and no more."""
 
 import contextlib
 import ctypes

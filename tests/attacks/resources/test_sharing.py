@@ -1,8 +1,6 @@
 """Taking what others share: files that are read, and what the kernel counts per user.
-
 A jail of root's runs as a user of its own; one of a plain user's runs as that user, and what the
-kernel gives to a user, the caller's other programs share with it.
-"""
+kernel gives to a user, the caller's other programs share with it."""
 
 import contextlib
 import fcntl

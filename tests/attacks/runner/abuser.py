@@ -1,5 +1,4 @@
 """A repository whose environment turns on the descriptors that its jail holds, and its client.
-
 The client is a process of its own (``held_client``); whoever asks for it watches it from outside.
 """
 

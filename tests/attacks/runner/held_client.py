@@ -1,5 +1,4 @@
 """A client held by its descriptors: ``python -m tests.attacks.runner.held_client``.
-
 argv: the repository, then one JSON object: ``acts`` (each for an environment of its own) and
 ``every``, as ``abuser`` takes them, ``policy``, ``options`` of ``make_env``, ``steps`` (the actions
 of each), and ``close`` (the thread that does it: ``"same"`` or ``"other"``). Prints each act with

@@ -1,7 +1,5 @@
 """What a jail holds open: every descriptor is known, and whom it could disturb with it.
-
-Smuggling further ones in and out.
-"""
+Smuggling further ones in and out."""
 
 import contextlib
 import ctypes

@@ -1,9 +1,7 @@
 """A jail turns on the doorbells that it shares with the client: the client goes on all the same.
-
 The client is a process of its own, and this one watches it: it has to come to its end, whatever the
 jail does with its copies of the descriptors. The control is a doorbell whose open file description
-both sides share: the same acts hold its writer for ever.
-"""
+both sides share: the same acts hold its writer for ever."""
 
 import os
 import subprocess

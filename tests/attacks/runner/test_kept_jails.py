@@ -1,8 +1,6 @@
 """A hostile runner in a jail that outlives it: ``restart="transparent"``; one of two shards lies.
-
 What a runner says, or leaves behind that goes on saying it, must count for nobody else: neither for
-its sibling, nor for the server, nor for the runner that comes in its place.
-"""
+its sibling, nor for the server, nor for the runner that comes in its place."""
 
 import time
 from pathlib import Path

@@ -1,9 +1,7 @@
 """A jail turns on slabs and doorbells that it shares with a server, which others use as well.
-
 Whatever it does there, the server goes on, and so does another environment of the same server.
 Controls: ``test_doorbells`` has the descriptor that holds its writer, ``test_slabs`` the memory
-that kills its reader.
-"""
+that kills its reader."""
 
 import os
 import select

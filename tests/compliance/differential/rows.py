@@ -1,8 +1,6 @@
 """Rows apart: ``send`` and ``recv``, resets of some, and what raises in one of them.
-
 The control is a ``SyncVectorEnv`` of each worker's sub-environments, since these are stepped
-together. What others do, and who is ready first, must change nothing of what it gives.
-"""
+together. What others do, and who is ready first, must change nothing of what it gives."""
 
 import warnings
 from collections import deque

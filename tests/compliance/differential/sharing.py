@@ -1,8 +1,6 @@
 """Asynchronous sub-environments that share something of their process, or do not.
-
 The control is Gymnasium's ``AsyncVectorEnv`` in this process, which gives each a process of its
-own. How many processes the sandbox uses is found out by it.
-"""
+own. How many processes the sandbox uses is found out by it."""
 
 import importlib.util
 from dataclasses import dataclass

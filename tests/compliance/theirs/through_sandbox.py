@@ -1,7 +1,5 @@
 """``SyncVectorEnv(env_fns)`` that lives in a sandbox; as a pytest plugin, in Gymnasium's place.
-
-Imports nothing of our tests: where somebody else's tests run, ``tests`` is their package.
-"""
+Imports nothing of our tests: where somebody else's tests run, ``tests`` is their package."""
 
 import contextlib
 import importlib
@@ -107,9 +105,7 @@ _POSITIONS = {
 
 class SingleMaker:
     """Called like a function or a class of theirs, whose environment is then in a sandbox.
-
-    In the sandbox it is the function or the class itself: their own code names it there.
-    """
+    In the sandbox it is the function or the class itself: their own code names it there."""
 
     def __init__(self, make: Any) -> None:
         self._make = make

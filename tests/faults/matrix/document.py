@@ -1,7 +1,5 @@
 """``docs/internals/faults-tried.md``, from the table: ``python -m tests.faults.matrix.document``.
-
-The seconds are the median cell of a row in one full run, kept in ``measured.json``.
-"""
+The seconds are the median cell of a row in one full run, kept in ``measured.json``."""
 
 import json
 from pathlib import Path

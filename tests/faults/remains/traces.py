@@ -1,9 +1,7 @@
 """What of ours is on this machine, by looking at the system and not at our own bookkeeping.
-
 Everything of a test lies below a temporary folder with a name of its own. It stands in the command
 line of the server, and in the environment of everybody below it: as the time zone, the one variable
-that everybody inherits and nobody minds.
-"""
+that everybody inherits and nobody minds."""
 
 from __future__ import annotations
 

@@ -161,8 +161,7 @@ def test_a_machine_that_is_slow_for_a_while_fails_nobody(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Where there is no time to look for an end, its limit says when it is; without one that is a
-    note, and no check that holds. The control: each reset is slow, and there is time to look.
-    """
+    note, and no check that holds. The control: each reset is slow, and there is time to look."""
     play, plays = traces.play, list[str]()
 
     def slow(*given: Any, **more: Any) -> traces.Trace:

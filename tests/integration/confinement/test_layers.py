@@ -1,7 +1,5 @@
 """Each layer denies what it is there for; the same source succeeds without a jail.
-
-What an environment can try is in ``tests/attacks``: files, sockets and processes outside.
-"""
+What an environment can try is in ``tests/attacks``: files, sockets and processes outside."""
 
 import os
 import re
@@ -204,8 +202,7 @@ class Late(Still):
 @pytest.mark.parametrize("strict", profiles("strict"))
 def test_a_link_below_tmp_leads_to_the_worker_all_the_time(tmp_path: Path, strict: str) -> None:
     """A jail has a /tmp of its own, with the links in it that its interpreter is reached by: what
-    is imported late is found, and with it the answer that needed it.
-    """
+    is imported late is found, and with it the answer that needed it."""
     (tmp_path / "env.py").write_text(LATE)
     with tempfile.TemporaryDirectory(dir="/tmp") as folder:
         os.chmod(folder, 0o755)

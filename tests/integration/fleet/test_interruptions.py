@@ -1,8 +1,6 @@
 """Ctrl-C, threads and signal handlers, in an environment over several workers.
-
 What docs/internals/interruption.md demands of one holds for all together;
-``tests/integration/lifecycle/test_interruptions.py`` tries starts and closes.
-"""
+``tests/integration/lifecycle/test_interruptions.py`` tries starts and closes."""
 
 import os
 import signal

@@ -1,7 +1,5 @@
 """Hundreds of workers behind one environment: nothing in the client is bounded by their number.
-
-One server in this process answers for all of them, so that it is the client that is tried.
-"""
+One server in this process answers for all of them, so that it is the client that is tried."""
 
 import resource
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Ctrl-C anywhere in a start or in a close: nothing is left, and what follows is as ever.
-
-Python looks for signals where a function begins, so these are the moments that are tried.
-"""
+Python looks for signals where a function begins, so these are the moments that are tried."""
 
 import os
 from collections.abc import Callable, Iterator

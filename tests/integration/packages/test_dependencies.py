@@ -103,8 +103,7 @@ def test_a_missing_module_and_its_cure(
 
 def test_what_a_package_imports_undeclared_joins_it(packages: Index, tmp_path: Path) -> None:
     """Once its import has failed, and if our table knows what brings it: an index is never asked
-    for a name that a jail has made up. The next time it is known.
-    """
+    for a name that a jail has made up. The next time it is known."""
     imports = {"forgets/__init__.py": "import six\nVERSION = six.VERSION\n"}
     make_wheel(packages.folder, "forgets", files=imports)
     make_wheel(packages.folder, "six", "1.5")
@@ -130,8 +129,7 @@ def test_what_a_package_imports_undeclared_joins_it(packages: Index, tmp_path: P
 
 def test_code_of_years_ago_runs_with_packages_of_its_day(packages: Index, tmp_path: Path) -> None:
     """The error says the day, ``"auto"`` means it, a lock keeps it, and a check finds a later one
-    that does.
-    """
+    that does."""
     for version, text in (("1.0", "new = old = 1\n"), ("2.0", "new = 1\n")):
         make_wheel(packages.folder, "ages", version, files={"ages/__init__.py": text})
     packages.uploaded = dict.fromkeys((one.name for one in packages.folder.iterdir()), "2023-01-01")
@@ -180,8 +178,7 @@ LOCAL = f"import {', '.join(WAYS)}\n" + importing(
 
 def test_each_way_to_a_module_leads_there_in_a_jail(tmp_path: Path) -> None:
     """Of ``pip install -e`` and ``--user``: tables of finders, links, ``.pth`` files. Of a finder
-    and no further: what lies beside its package is here, and not there.
-    """
+    and no further: what lies beside its package is here, and not there."""
     base = tmp_path / "projects"
     for number, name in enumerate(WAYS):
         (base / name / name).mkdir(parents=True)

@@ -1,8 +1,6 @@
 """LeRobot's rollouts: a sub-environment whose episode has ended does nothing until the next one.
-
 The oracle is what LeRobot's ``FreezeAfterEpisodeEnd`` does around each sub-environment;
-``tests/lerobot`` compares with that class itself.
-"""
+``tests/lerobot`` compares with that class itself."""
 
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What a listening server tells whoever watches it: figures, health and readiness, over HTTP.
-
-The port has no keys: so there are attacks on it, while a client's work goes on.
-"""
+The port has no keys: so there are attacks on it, while a client's work goes on."""
 
 import contextlib
 import http.client

@@ -23,8 +23,7 @@ MEMORY = 80 * 2**20
 @contextmanager
 def cluster_of(*nodes: dict[str, Any]) -> Iterator[Any]:
     """A head, where nothing is placed by itself, and nodes with these resources.
-    Yields Ray's own ``Cluster``; the process is not connected to it.
-    """
+    Yields Ray's own ``Cluster``; the process is not connected to it."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     from ray.cluster_utils import Cluster
 
@@ -52,8 +51,7 @@ def add_node(cluster: Any, num_cpus: float = 2, **resources: float) -> Any:
 
 def _started(cluster: Any, **arguments: Any) -> Any:
     """A node. Ray gives it 30 s, and it gives its own agents half of that, which a machine whose
-    cores are taken away may not have. What a try has left is ended: it would slow the next one.
-    """
+    cores are taken away may not have. What a try has left is ended: it would slow the next one."""
     for left in reversed(range(_TRIES)):
         before = psutil.Process().children(recursive=True)
         try:
@@ -81,8 +79,7 @@ def servers() -> list[psutil.Process]:
 
 def only_server() -> psutil.Process:
     """The one server that there is, once those of earlier tests have ended: Ray ends an actor in
-    its own time, and the server ends after that.
-    """
+    its own time, and the server ends after that."""
     assert eventually(lambda: len(servers()) == 1), servers()
     [server] = servers()
     return server

@@ -1,8 +1,6 @@
 """A repository on a node of a cluster: from its jail it reaches nothing of Ray.
-
 Whoever reaches a Ray cluster runs code on all of it, so an actor that is there afterwards is the
-whole of the damage. Each attack succeeds in the same run where nothing confines it.
-"""
+whole of the damage. Each attack succeeds in the same run where nothing confines it."""
 
 import os
 import secrets

@@ -44,8 +44,7 @@ class TestCounter(VectorEnvCompliance):
 def test_a_lost_node_loses_its_rows_alone(cluster: Any) -> None:
     """Ray spreads workers over the nodes, and one of these goes in the midst of an episode: what
     ``restart`` promises comes true, by ``num_workers`` and by a list of places. Ray counts what is
-    held, and in the end nothing is.
-    """
+    held, and in the end nothing is."""
     nodes = {node.node_id: node for node in (add_node(cluster, 1, place=16) for _ in range(4))}
     place = RaySandbox(num_cpus=0.05, resources={"place": 1}, placement_s=60)
     workers = {"sandbox": place, "num_workers": WORKERS}

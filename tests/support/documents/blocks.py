@@ -1,8 +1,6 @@
 """The blocks of code in the documents, and what executes them.
-
 Shell and Python are executed with the others of their document, but for what ``APART`` and
-``NOT_EXECUTED`` name by its beginning.
-"""
+``NOT_EXECUTED`` name by its beginning."""
 
 import re
 from collections.abc import Collection, Iterator

@@ -1,7 +1,5 @@
 """The tables of ``docs/checks.md``, written from the checks and the settings.
-
-Write it again with ``python -m tests.support.documents.checks``.
-"""
+Write it again with ``python -m tests.support.documents.checks``."""
 
 import textwrap
 

@@ -1,5 +1,4 @@
 """``examples/quickstart.ipynb``: its cells are executed here, and shown with what they display.
-
 ``python -m tests.support.documents.notebook`` executes them and writes what they display into it.
 """
 

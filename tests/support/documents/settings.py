@@ -1,7 +1,5 @@
 """``docs/settings.md``, written from the docstrings and defaults of what it describes.
-
-Write it again with ``python -m tests.support.documents.settings``.
-"""
+Write it again with ``python -m tests.support.documents.settings``."""
 
 import dataclasses
 import inspect

@@ -1,9 +1,7 @@
 """Executes the blocks of a document as its reader does: in one shell, one after the other.
-
 The reader's home, caches and temporary folder are the test's, and so is the Hub, which has what the
 documents name. ``_READ_AS`` is what a reader puts in place of what is written, ``_PRELUDE`` what he
-does between the lines; other than that, the shell gets the text.
-"""
+does between the lines; other than that, the shell gets the text."""
 
 import contextlib
 import os

@@ -1,13 +1,10 @@
 """A pytest plugin: the tests that a newcomer needs to trust the copy, and ``--full`` for all.
-
 Without a path, ``-k``, ``-m`` or ``--full``, the short form is run: what bears the marker
 ``short``, as a module, a class or a function. ``@pytest.mark.short("strict-")`` takes, of a
 function's cases, those whose parameters' id starts so. It is to be some hundred tests: the main
 job, an attack of each kind with its control, parity over both lanes, and the commands.
-
 CI repeats some tests as another user and with other versions of Python and of packages, there with
-``--one-case``: of a test's cases the first, for each profile and each lane that it names.
-"""
+``--one-case``: of a test's cases the first, for each profile and each lane that it names."""
 
 from pathlib import Path
 
