@@ -13,16 +13,7 @@ import pytest
 import yaml
 from huggingface_hub import hf_hub_download
 
-from envhub_sandbox import make_env
-from envhub_sandbox.errors import (
-    EnvHubError,
-    HubReferenceError,
-    LockDriftError,
-    RepositoryUnavailableError,
-    SnapshotError,
-    SnapshotIntegrityError,
-    SnapshotTooLargeError,
-)
+from envhub_sandbox import errors, make_env
 from envhub_sandbox.extras.packages import interpreters
 from envhub_sandbox.extras.packages.locks import lockfile
 from envhub_sandbox.extras.packages.locks.pylock import PylockPackage, Wheel
@@ -87,7 +78,7 @@ def test_an_asset_that_lies_about_its_hashes(
     """The Hub serves other bytes for the pinned commit; a loader takes them, a jail never."""
     stub_hub.add("org/lies", {"x": "as listed"}).served["x"] = b"other bytes"
     asset = f"org/lies@{COMMIT}"
-    with pytest.raises(SnapshotIntegrityError, match="It is an asset"):
+    with pytest.raises(errors.SnapshotIntegrityError, match="It is an asset"):
         make(*([asset] if declared else []), assets=[] if declared else [asset])
     make_card = yaml.safe_dump({"envhub": {"assets": [asset]}})
     stub_hub.repositories["model", "org/repo"].files["README.md"] = f"---\n{make_card}---".encode()
@@ -100,7 +91,7 @@ def test_a_card_declares_ten_thousand_assets(stub_hub: StubHub, make: Make, tmp_
         stub_hub.add(f"org/many{number}", {"x": "x"})
     for count in (17, 10_000):
         many = [f"org/many{number}@{COMMIT}" for number in range(count)]
-        with contextlib.suppress(SnapshotError), make(*many) as suites:
+        with contextlib.suppress(errors.SnapshotError), make(*many) as suites:
             assert suites.env.call("found") == (["models--org--repo"],)
         assert not asked_for(stub_hub, "org/many")
     assert len(followed(stub_hub, tmp_path / "control", 5)) == 5
@@ -116,7 +107,7 @@ def test_cards_assets_share_what_one_repository_may_bring(
     for number in range(2):
         stub_hub.add(f"org/large{number}", {"x": "x" * 1000})
     both = [f"org/large{number}@{COMMIT}" for number in range(2)]
-    with pytest.raises(SnapshotTooLargeError, match="org/large1"):
+    with pytest.raises(errors.SnapshotTooLargeError, match="org/large1"):
         make(*both)
     with make(assets=both) as suites:  # what the caller names has a limit of its own each
         assert len(suites.provenance["assets"]) == 2
@@ -157,16 +148,20 @@ def test_what_the_callers_login_has_brought_is_no_strangers(
     with make(asset, assets=[asset], token="hf_mine") as suites:
         assert suites.env.call("asset", "me--mine") == (["secret"],), "the control failed"
     before = len(stub_hub.requests)
-    with pytest.raises(RepositoryUnavailableError, match=r"README\.md names it, and it is fetched"):
+    with pytest.raises(
+        errors.RepositoryUnavailableError, match=r"README\.md names it, and it is fetched"
+    ):
         make(asset, token="hf_mine")
-    with pytest.raises(RepositoryUnavailableError, match="the lock names it, and it is fetched"):
+    with pytest.raises(
+        errors.RepositoryUnavailableError, match="the lock names it, and it is fetched"
+    ):
         make(asset, token="hf_mine", lock=locked(tmp_path, asset))
     asked = zip(stub_hub.requests[before:], stub_hub.authorizations[before:], strict=True)
     assert {token for request, token in asked if "me/mine" in request} == {None}
     mine.token, mine.gated = "", False
     with make(asset, token="hf_mine") as suites:  # now that everybody gets it
         assert suites.env.call("asset", "me--mine") == (["secret"],)
-    with pytest.raises(LockDriftError):
+    with pytest.raises(errors.LockDriftError):
         make(asset, token="hf_mine", lock=locked(tmp_path, asset))
     before = len(stub_hub.requests)
     make(asset, token="hf_mine").close()
@@ -192,7 +187,7 @@ def test_what_the_callers_login_has_brought_is_no_strangers(
 )
 def test_a_card_names_what_is_no_asset(stub_hub: StubHub, make: Make, asset: str, why: str) -> None:
     """Its own id at another commit, a moving revision, paths, and other hosts: nothing is asked."""
-    with pytest.raises(HubReferenceError, match=why) as caught:
+    with pytest.raises(errors.HubReferenceError, match=why) as caught:
         make(asset)
     assert "org/repo" in str(caught.value)
     assert not asked_for(stub_hub, "data")
@@ -201,7 +196,7 @@ def test_a_card_names_what_is_no_asset(stub_hub: StubHub, make: Make, asset: str
 
 def test_two_names_for_one_repository(stub_hub: StubHub, make: Make) -> None:
     stub_hub.add("org/data", {"x": "x"}).earlier["b" * 40] = {"x": b"y"}
-    with pytest.raises(EnvHubError, match="shown once, at one commit"):
+    with pytest.raises(errors.EnvHubError, match="shown once, at one commit"):
         make(f"org/data@{COMMIT}", f"models/org/data@{'b' * 40}")
     with make(f"org/data@{'b' * 40}", assets=[f"org/data@{COMMIT}"]) as suites:
         assert suites.provenance["assets"] == [f"org/data@{COMMIT}"]  # the caller's goes first

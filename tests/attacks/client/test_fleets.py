@@ -10,13 +10,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from envhub_sandbox import make_env
-from envhub_sandbox.errors import (
-    EnvHubError,
-    MessageTooLargeError,
-    RemoteEnvError,
-    RemoteProtocolError,
-)
+from envhub_sandbox import errors, make_env
 from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
@@ -108,7 +102,7 @@ def test_rows_that_are_not_its_own_are_refused(
         before = liar.lies[m.Step]
         liar.lies[m.Step] = relayed(step_done(**(TRUE | LIES[what])))
         error = refuses(lambda: env.step(ACTIONS))
-        assert isinstance(error, RemoteProtocolError)
+        assert isinstance(error, errors.RemoteProtocolError)
         assert f"sub-environments 0 to {NUM_ENVS - 1} of {ALL}" in str(error)
         assert states(env) == ["DEAD", "READY"]
         liar.lies[m.Step] = before
@@ -124,7 +118,7 @@ def test_values_for_others_are_refused(liar: LyingServer, honest: LyingServer, f
     with fleet(liar, honest, folder) as env:
         assert env.call("x", 1) == ("true",) * ALL  # the control
         liar.lies[m.Call] = relayed(m.Value(("lie",) * ALL))
-        assert isinstance(refuses(lambda: env.call("x", 1)), RemoteProtocolError)
+        assert isinstance(refuses(lambda: env.call("x", 1)), errors.RemoteProtocolError)
         assert states(env) == ["DEAD", "READY"]
 
 
@@ -150,7 +144,7 @@ def test_others_infos_refused(
         assert env.step(ACTIONS)[4]["a"].tolist() == [8, 9, 1, 2]  # the control
         liar.lies[m.FetchInfosApart] = relayed(m.Value(OWN[what]))
         error = refuses(lambda: env.step(ACTIONS))
-        assert isinstance(error, RemoteProtocolError)
+        assert isinstance(error, errors.RemoteProtocolError)
         assert states(env) == ["DEAD", "READY"]
 
 
@@ -181,10 +175,10 @@ def test_own_infos_that_would_take_too_much_are_refused() -> None:
     """Joined here, one row's makes a column for all; and what does not fit is told in short."""
     joins = Results(wire.env_manifest(OBSERVATION, ACTION, 64, sync=True), [(0, 64)])
     assert joins.joined_own([m.Value(((0, {"a": np.zeros(1000)}, {}),))])["a"].shape == (64, 1000)
-    with pytest.raises(MessageTooLargeError):
+    with pytest.raises(errors.MessageTooLargeError):
         joins.joined_own([m.Value(((0, {"a": np.zeros(1 << 20)}, {}),))])
     name = "x" * 100_000
-    with pytest.raises(RemoteEnvError) as caught:
+    with pytest.raises(errors.RemoteEnvError) as caught:
         joins.joined_own([m.Value(((0, {name: 1.0}, {}), (1, {name: "text"}, {})))])
     assert len(str(caught.value)) < 1000
 
@@ -204,7 +198,7 @@ def test_infos_that_came_apart_are_of_its_own_rows_alone() -> None:
     lies: list[Any] = [{place: {"a": 9}} for place in ("0", True, None)]
     lies += [{0: 5}, {0: RemoteObject("t", "r")}, {"x": np.ones(9), "_x": np.ones(9, bool)}]
     for infos in lies:
-        with pytest.raises(RemoteProtocolError):
+        with pytest.raises(errors.RemoteProtocolError):
             joins.own(joins.infos([infos, honest]))
 
 
@@ -213,7 +207,7 @@ def test_rewards_of_different_shapes_are_not_joined() -> None:
     joins = Results(wire.env_manifest(OBSERVATION, ACTION, 2, sync=False), [(0, 1), (1, 2)])
     over = np.zeros(1, bool)
     parts: list[Any] = [(_zeros(1, 3), _zeros(1, several), over, over, {}) for several in (2, 3)]
-    with pytest.raises(RemoteProtocolError, match="different shapes"):
+    with pytest.raises(errors.RemoteProtocolError, match="different shapes"):
         joins.joined_steps(parts)
 
 
@@ -225,7 +219,7 @@ def test_another_space_is_refused_before_the_first_step(
     built = env_manifest(single_observation_space=other)
     honest.lies[m.Build] = relayed(m.BuildDone(encode_env(built)))
     named = "spaces are not equivalent"
-    with pytest.raises(RemoteEnvError, match=named), fleet(liar, honest, folder):
+    with pytest.raises(errors.RemoteEnvError, match=named), fleet(liar, honest, folder):
         pass
     del honest.lies[m.Build]
     with fleet(liar, honest, folder):  # the control
@@ -237,5 +231,5 @@ def test_more_rows_are_refused_before_the_first_step(
 ) -> None:
     built = wire.env_manifest(OBSERVATION, ACTION, ALL, sync=True)
     liar.lies[m.Build] = relayed(m.BuildDone(encode_env(built)))
-    with pytest.raises(EnvHubError), fleet(liar, honest, folder):
+    with pytest.raises(errors.EnvHubError), fleet(liar, honest, folder):
         pass

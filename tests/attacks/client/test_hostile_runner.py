@@ -13,13 +13,7 @@ import cloudpickle
 import numpy as np
 import pytest
 
-from envhub_sandbox import make_env
-from envhub_sandbox.errors import (
-    EnvHubError,
-    RemoteProtocolError,
-    WorkerDiedError,
-    WorkerTimeoutError,
-)
+from envhub_sandbox import errors, make_env
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
 from tests.attacks.client.lies import GROWTH, MIB, Canary, peak_growth
@@ -126,7 +120,7 @@ def told_lies(env: Any, **lie: str) -> tuple[Exception, int]:
     env.reset(options=lie)
     before = resident()
     del before[os.getpid()]
-    with pytest.raises(EnvHubError) as caught:
+    with pytest.raises(errors.EnvHubError) as caught:
         env.step([0, 0])
     return caught.value, most_grown(before)
 
@@ -172,9 +166,9 @@ def test_bombs_from_a_jail_are_refused(liar: Any, what: str) -> None:
 def test_rule_breakers_lose_their_jail(liar: Any, mode: str) -> None:
     """Two answers, another id, no answer at all: the environment is dead, in plain words."""
     error, _ = told_lies(liar, mode=mode)
-    if mode == "twice" and isinstance(error, RemoteProtocolError):
+    if mode == "twice" and isinstance(error, errors.RemoteProtocolError):
         return  # the first answer came alone, and was of a wrong kind
-    assert isinstance(error, WorkerDiedError)
+    assert isinstance(error, errors.WorkerDiedError)
     assert error.reason == ("exit" if mode == "exit" else "protocol")
 
 
@@ -187,6 +181,6 @@ def test_silence_from_a_jail_ends_at_the_deadline(
     started = time.monotonic()
     with inside.hurried(liar, step_s=0.5):
         error, _ = told_lies(liar, mode=mode)
-    assert isinstance(error, WorkerTimeoutError)
+    assert isinstance(error, errors.WorkerTimeoutError)
     assert time.monotonic() - started < TIMEOUTS["step_s"]
     liar.reset(options={"mode": "nothing"})

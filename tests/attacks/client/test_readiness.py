@@ -11,14 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox import make_env
-from envhub_sandbox.errors import (
-    EnvHubError,
-    RemoteProtocolError,
-    WorkerDiedError,
-    WorkerError,
-    WorkerTimeoutError,
-)
+from envhub_sandbox import errors, make_env
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from tests.attacks.harness import TIMEOUTS, Arena
@@ -164,7 +157,7 @@ class Among:
         while min(counts.values()) < STEPS:
             try:
                 received = self.receive()
-            except EnvHubError as error:
+            except errors.EnvHubError as error:
                 of_it.append(_of_the_hostile(error))
                 continue
             again = []
@@ -182,7 +175,7 @@ class Among:
         return of_it
 
 
-def _of_the_hostile(error: EnvHubError) -> EnvHubError:
+def _of_the_hostile(error: errors.EnvHubError) -> errors.EnvHubError:
     assert error.env_ids == (HOSTILE,)
     return error
 
@@ -215,13 +208,13 @@ def test_who_is_never_ready_holds_none_up(strict: Arena, home: Path, lane: str, 
         with inside.hurried_part(suites.env, HOSTILE, step_s=PATIENCE_S):
             late = found.others_go_on()  # unless they took longer than a step of it may
             if not late:
-                with pytest.raises(WorkerTimeoutError) as caught:
+                with pytest.raises(errors.WorkerTimeoutError) as caught:
                     found.env.recv(COUNT)
                 late = [_of_the_hostile(caught.value)]
-        assert [type(one) for one in late] == [WorkerTimeoutError]
+        assert [type(one) for one in late] == [errors.WorkerTimeoutError]
     with among(strict, folder, lane, min_ready=None, num_workers=COUNT) as suites:
         suites.env.reset(seed=1)
-        with inside.hurried(suites.env, step_s=1.0), pytest.raises(WorkerTimeoutError):
+        with inside.hurried(suites.env, step_s=1.0), pytest.raises(errors.WorkerTimeoutError):
             suites.env.step(np.zeros(COUNT, np.int64))  # the control: it holds up a step of all
 
 
@@ -269,7 +262,7 @@ def test_who_shares_its_jail_and_breaks_a_rule_has_nobody_elses_results(
         receive()  # the control
         suites.env.send(np.zeros(COUNT, np.int64))
         suites.env.send(np.zeros(COUNT, np.int64))
-        with pytest.raises((RemoteProtocolError, WorkerDiedError)) as caught:
+        with pytest.raises((errors.RemoteProtocolError, errors.WorkerDiedError)) as caught:
             receive_all()
         assert HOSTILE in (caught.value.env_ids or ())
 
@@ -285,21 +278,21 @@ BROKEN = [
 def test_who_breaks_a_rule_ends_alone(strict: Arena, tmp_path: Path, lane: str, mode: str) -> None:
     with among(strict, liar(tmp_path, mode), lane) as suites:
         found = Among(suites.env)
-        given_up = [one for one in found.others_go_on() if isinstance(one, EnvHubError)]
+        given_up = [one for one in found.others_go_on() if isinstance(one, errors.EnvHubError)]
         deadline = time.monotonic() + 120
         while not given_up:
             assert time.monotonic() < deadline
             try:
                 found.ask_again_if_it_has_answered()
-            except WorkerDiedError:  # its second answer came when it owed none
+            except errors.WorkerDiedError:  # its second answer came when it owed none
                 break
             try:
                 found.receive()
-            except EnvHubError as error:
+            except errors.EnvHubError as error:
                 given_up.append(_of_the_hostile(error))
-        with pytest.raises(WorkerError) as refused:
+        with pytest.raises(errors.WorkerError) as refused:
             found.env.send(np.zeros(1, np.int64), [HOSTILE])
-        assert isinstance(refused.value, WorkerDiedError)
+        assert isinstance(refused.value, errors.WorkerDiedError)
 
 
 @pytest.mark.parametrize("word", ["SEQUENCE", "OUTCOME"])
@@ -319,9 +312,9 @@ def test_an_answer_that_is_taken_back_holds_nobody_up(
             try:
                 received = found.env.recv(1)
                 of_it += [received.infos] if HOSTILE in received.env_ids else []
-            except EnvHubError as error:
+            except errors.EnvHubError as error:
                 of_it.append(_of_the_hostile(error))
-        wanted = dict if word == "SEQUENCE" else RemoteProtocolError
+        wanted = dict if word == "SEQUENCE" else errors.RemoteProtocolError
         assert isinstance(of_it[0], wanted), "it was waited for"
 
 

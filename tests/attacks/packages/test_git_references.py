@@ -15,12 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.errors import (
-    EnvHubError,
-    HubReferenceError,
-    RepositoryUnavailableError,
-    SnapshotTooLargeError,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.extras.sources import git_address as address
 from envhub_sandbox.extras.sources import git_commits as commits
 from envhub_sandbox.hub.answers import HubFailure
@@ -172,7 +167,7 @@ def test_alternates_are_not_followed(repository: Path, tmp_path: Path) -> None:
         plain_git("-c", "http.followRedirects=true", "clone", f"{where}/x", clone)
         assert asked, "the control failed"
         asked.clear()
-        with pytest.raises(EnvHubError):
+        with pytest.raises(errors.EnvHubError):
             snapshot_named(f"git+{where}/x@{head}")
         assert not asked
 
@@ -207,7 +202,7 @@ def test_no_login_is_sent(
         assert any("Authorization" in one.headers for one in asked), "the control failed"
         assert ran(program), "the control failed"
         asked.clear()
-        with pytest.raises(RepositoryUnavailableError):
+        with pytest.raises(errors.RepositoryUnavailableError):
             snapshot_named(f"git+{where}/org/repo")
         assert asked
         assert not any("Authorization" in one.headers for one in asked)
@@ -231,7 +226,7 @@ def test_a_commit_is_the_one_that_was_asked_for(repository: Path, tmp_path: Path
         plain_git("clone", f"{where}/org/repo", clone)
         assert "# evil" in Path(clone, "env.py").read_text(), "the control failed"
         assert "# evil" in (brought(where, "main").root / "env.py").read_text()
-        with pytest.raises(RepositoryUnavailableError, match="git"):
+        with pytest.raises(errors.RepositoryUnavailableError, match="git"):
             brought(where, approved)
         assert commits.day_of(f"{where}/org/repo", evil)
         with pytest.raises(HubFailure, match="git"):  # fetched without files
@@ -257,14 +252,14 @@ def test_nothing_in_a_reference_is_an_option_or_a_program(
     plain_git("ls-remote", option, str(repository))
     assert ran(program), "the control failed"
     for hostile in (option, str(program)):
-        with pytest.raises(HubReferenceError):
+        with pytest.raises(errors.HubReferenceError):
             HubRef.parse(text.format(hostile))
-        with pytest.raises((HubReferenceError, EnvHubError)):
+        with pytest.raises((errors.HubReferenceError, errors.EnvHubError)):
             snapshot_named(text.format(hostile))
-        with pytest.raises(HubReferenceError):
+        with pytest.raises(errors.HubReferenceError):
             commits.resolve(text.format(hostile).removeprefix("git+"), "main")
     for revision in (option, f"main {option}", "a..b"):
-        with pytest.raises(HubReferenceError):
+        with pytest.raises(errors.HubReferenceError):
             commits.resolve("http://127.0.0.1:9/x", revision)
     assert not ran(program)
 
@@ -282,7 +277,7 @@ def test_names_of_files_cost_no_memory(repository: Path, tmp_path: Path) -> None
         assert len(listed) > 40_000_000, "the control failed"
         tracemalloc.start()
         try:
-            with pytest.raises(SnapshotTooLargeError, match="a name that is too long"):
+            with pytest.raises(errors.SnapshotTooLargeError, match="a name that is too long"):
                 snapshot_named(f"git+{where}/org/repo")
             assert tracemalloc.get_traced_memory()[1] < 20_000_000
         finally:

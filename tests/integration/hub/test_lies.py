@@ -11,12 +11,7 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.errors import (
-    RepositoryUnavailableError,
-    SnapshotError,
-    SnapshotIntegrityError,
-    SnapshotTooLargeError,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.hub.logins import authorization
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import SnapshotLimits, fetch
@@ -57,9 +52,11 @@ def test_other_content_than_the_pinned_commit_is_refused(
 ) -> None:
     lies = getattr(repository, where)
     lies |= {path} if lie is None else {path: lie}
-    with pytest.raises((SnapshotIntegrityError, RepositoryUnavailableError)) as caught:
+    with pytest.raises(
+        (errors.SnapshotIntegrityError, errors.RepositoryUnavailableError)
+    ) as caught:
         get()
-    assert where != "served" or isinstance(caught.value, SnapshotIntegrityError)
+    assert where != "served" or isinstance(caught.value, errors.SnapshotIntegrityError)
     assert where != "served" or path in str(caught.value)
     assert repository.commit in str(caught.value)
     assert not stored_files(snapshot_store)
@@ -72,7 +69,7 @@ def test_other_commit_than_the_pinned_one_is_refused(stub_hub: StubHub, get: Fet
     repository = stub_hub.repositories["model", "org/repo"]
     repository.commit, repository.refs = "b" * 40, {"a" * 40}
     ref = HubRef("org/repo", "a" * 40, repo_type="model")
-    with pytest.raises(SnapshotIntegrityError, match=r"another commit, b{40}"):
+    with pytest.raises(errors.SnapshotIntegrityError, match=r"another commit, b{40}"):
         fetch(ref, token=False, endpoint=stub_hub.endpoint)
     assert pinned != repository.commit
 
@@ -81,7 +78,7 @@ def test_other_commit_than_the_pinned_one_is_refused(stub_hub: StubHub, get: Fet
 def test_a_revision_that_is_no_commit_is_refused(stub_hub: StubHub, get: Fetch, sha: Any) -> None:
     """It would be the name of a folder here."""
     stub_hub.fail("/revision/", 200, pieces=lambda: [json.dumps({"sha": sha}).encode()])
-    with pytest.raises(RepositoryUnavailableError, match="ValueError"):
+    with pytest.raises(errors.RepositoryUnavailableError, match="ValueError"):
         fetch(HubRef.parse("models/org/repo"), token=False, endpoint=stub_hub.endpoint)
     assert not [request for request in stub_hub.requests if "/tree/" in request]
 
@@ -122,7 +119,7 @@ def test_half_deleted_snapshot_is_fetched_again(get: Fetch, stub_hub: StubHub) -
     snapshot.root.chmod(0o755)
     (snapshot.root / "env.py").unlink()
     stub_hub.fail("/api/models/", 403)
-    with pytest.raises(RepositoryUnavailableError, match=r"'env\.py' is missing") as caught:
+    with pytest.raises(errors.RepositoryUnavailableError, match=r"'env\.py' is missing") as caught:
         get()
     assert "That was tried" in str(caught.value)
     stub_hub.faults.clear()
@@ -142,7 +139,7 @@ def test_repository_over_a_limit_is_refused_before_the_download(
     """The listing decides; no content is asked for, and the error names the limit. A snapshot that
     came under wider limits does not pass narrower ones, either."""
     for is_stored in (False, True):
-        with pytest.raises(SnapshotTooLargeError, match=name):
+        with pytest.raises(errors.SnapshotTooLargeError, match=name):
             get(limits=limits)
         assert is_stored or not requests_for_files(stub_hub)
         get()
@@ -151,7 +148,7 @@ def test_repository_over_a_limit_is_refused_before_the_download(
 def test_endless_listing_is_left_at_the_limit(stub_hub: StubHub, get: Fetch) -> None:
     stub_hub.add("org/repo", {"env.py": GOOD, **{f"f{n}": b"" for n in range(50)}})
     stub_hub.page_size = 2
-    with pytest.raises(SnapshotTooLargeError, match="max_files=5"):
+    with pytest.raises(errors.SnapshotTooLargeError, match="max_files=5"):
         get(limits=SnapshotLimits(max_files=5))
     assert len([request for request in stub_hub.requests if "/tree/" in request]) == 3
 
@@ -162,7 +159,7 @@ def test_hostile_name_is_refused_before_the_download(
 ) -> None:
     """A name that could leave the tree or hide never becomes a path here."""
     repository.files[name] = EVIL
-    with pytest.raises(SnapshotError, match="refused"):
+    with pytest.raises(errors.SnapshotError, match="refused"):
         get()
     assert not requests_for_files(stub_hub)
 
@@ -175,7 +172,7 @@ def test_malformed_listing_is_refused(
 ) -> None:
     """Fields of the wrong type or form are named, not guessed at."""
     repository.listed["env.py"] = fields
-    with pytest.raises(SnapshotIntegrityError, match="listing has an entry"):
+    with pytest.raises(errors.SnapshotIntegrityError, match="listing has an entry"):
         get()
 
 
@@ -209,11 +206,11 @@ def test_headers_do_not_write_outside_the_hub_cache(
 ) -> None:
     """The Hub client makes paths of ETag and others; the control shows it."""
     repository.head_headers = {"ETag": '"../../../evil"'}
-    with pytest.raises(SnapshotIntegrityError, match=r"header ETag .*evil"):
+    with pytest.raises(errors.SnapshotIntegrityError, match=r"header ETag .*evil"):
         get()
     assert outside(tmp_path) == []
     monkeypatch.setattr("envhub_sandbox.hub.client.guarded", lambda _: contextlib.nullcontext())
-    with contextlib.suppress(SnapshotError):
+    with contextlib.suppress(errors.SnapshotError):
         get()
     assert "evil" in outside(tmp_path)
 
@@ -237,7 +234,7 @@ def test_endless_answer_is_left(stub_hub: StubHub, get: Fetch, where: str, packe
     if packed:
         headers["Content-Encoding"] = "gzip"
     stub_hub.fail(where, 200, headers=headers, pieces=_packed if packed else _spaces)
-    with pytest.raises(SnapshotIntegrityError, match="an answer has over"):
+    with pytest.raises(errors.SnapshotIntegrityError, match="an answer has over"):
         get()
     assert packed or stub_hub.sent < 128 * _MIB
     taken = len(plain_get(f"{stub_hub.endpoint}/api/models/org/repo/tree/main/revision/x"))
@@ -258,7 +255,7 @@ def test_endless_pages_without_files_are_left(
     monkeypatch.setattr("envhub_sandbox.hub.client.MAX_IDLE_PAGES", 20)
     monkeypatch.setattr(repository, "tree", lambda: folders)
     stub_hub.page_size = 1
-    with pytest.raises(SnapshotIntegrityError, match="listing does not end"):
+    with pytest.raises(errors.SnapshotIntegrityError, match="listing does not end"):
         get()
     assert len([request for request in stub_hub.requests if "/tree/" in request]) == 21
 
@@ -267,7 +264,7 @@ def test_endless_pages_without_files_are_left(
 def test_other_json_than_a_listing_is_refused(stub_hub: StubHub, get: Fetch, body: bytes) -> None:
     """Too deep, too large a number, no list: an error of ours that names the repository."""
     stub_hub.fail("/tree/", 200, pieces=lambda: [body])
-    with pytest.raises(SnapshotError, match="org/repo"):
+    with pytest.raises(errors.SnapshotError, match="org/repo"):
         get()
 
 
@@ -286,7 +283,7 @@ def test_redirect_takes_no_token_along(
         # another name is another host; the same one with another port may be sent the token
         target = location.format(other=other.endpoint.replace("127.0.0.1", "localhost"))
         stub_hub.fail(where, 302, headers={"Location": target})
-        with pytest.raises(SnapshotError):
+        with pytest.raises(errors.SnapshotError):
             get(token="hf_secret")
         assert set(other.authorizations) <= {None}
         assert "Bearer hf_secret" in stub_hub.authorizations
@@ -326,7 +323,7 @@ def test_secrets_are_in_no_traceback(
     monkeypatch.setenv("HF_TOKEN", token)
     if what == "nothing listens":
         stub_hub.stop()
-    with caplog.at_level("DEBUG"), pytest.raises(SnapshotError) as caught:
+    with caplog.at_level("DEBUG"), pytest.raises(errors.SnapshotError) as caught:
         get(token=None if what == "/resolve/" else token, endpoint=endpoint)
     said = "".join(traceback.format_exception(caught.value)) + repr(caught.value)
     ours = [record for record in caplog.records if record.name.startswith("envhub")]

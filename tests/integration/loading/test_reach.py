@@ -5,14 +5,7 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox import make_env
-from envhub_sandbox.errors import (
-    DependencyError,
-    LoadError,
-    RemoteEnvError,
-    RemoteEnvWarning,
-    WorkerDiedError,
-)
+from envhub_sandbox import errors, make_env
 from tests.support.repositories import STILL, write_repository
 
 PARSES = f"""
@@ -44,7 +37,7 @@ def test_a_command_line_is_parsed(tmp_path: Path) -> None:
 def test_argparse_that_leaves_shows_its_usage(tmp_path: Path) -> None:
     """Instead of ``SystemExit: 2``, which says nothing."""
     folder = write_repository(tmp_path / "repo", PARSES.replace("ARGUMENTS", "required=True"))
-    with pytest.raises(LoadError) as caught:
+    with pytest.raises(errors.LoadError) as caught:
         make_env(str(folder))
     assert "usage: env.py [-h] --level LEVEL" in str(caught.value)
     assert "the following arguments are required: --level" in str(caught.value)
@@ -69,7 +62,7 @@ def test_what_is_beside_a_named_file_is_missed_aloud(tmp_path: Path, name: str, 
     (folder / name).parent.mkdir(exist_ok=True)
     (folder / name).write_text("")
     word = rf"{name!r} is there, in {folder}, but a file .*name that with .*: '{folder}:env\.py'"
-    expected = (LoadError, DependencyError, RemoteEnvError)
+    expected = (errors.LoadError, errors.DependencyError, errors.RemoteEnvError)
     with pytest.raises(expected, match=word) as caught, make_env(folder / "env.py") as suites:
         suites.env.call("run", code)
     assert "environment of its own" not in str(caught.value)
@@ -99,7 +92,7 @@ PIP = "[sys.executable, '-m', 'pip', 'install', 'no-such-one']"
 def test_what_is_not_there_fails_with_what_brings_it(env: Any, code: str, advice: str) -> None:
     """One sentence, which names the argument; the program's own words stay."""
     env.reset()
-    with pytest.raises(RemoteEnvError) as caught:
+    with pytest.raises(errors.RemoteEnvError) as caught:
         env.call("run", code)
     assert advice in str(caught.value)
     assert str(caught.value).lower().count("a jail has no ") == 1
@@ -108,7 +101,7 @@ def test_what_is_not_there_fails_with_what_brings_it(env: Any, code: str, advice
 def test_other_errors_get_no_advice(env: Any) -> None:
     """What has nothing to do with a network or a display."""
     env.reset()
-    with pytest.raises(RemoteEnvError) as caught:
+    with pytest.raises(errors.RemoteEnvError) as caught:
         env.call("run", "raise ValueError('the display of 3 networks is 97')")
     assert "A jail has no" not in str(caught.value)
 
@@ -116,7 +109,7 @@ def test_other_errors_get_no_advice(env: Any) -> None:
 def test_a_window_that_cannot_be_opened_is_no_mere_abort(env: Any) -> None:
     env.reset()
     said = 'qt.qpa.plugin: Could not load the Qt platform plugin "xcb" in ""'
-    with pytest.raises(WorkerDiedError, match="It tried to open a window") as caught:
+    with pytest.raises(errors.WorkerDiedError, match="It tried to open a window") as caught:
         env.call("run", f"sys.stderr.write({said!r} + chr(10)); sys.stderr.flush(); os.abort()")
     assert caught.value.signal == "SIGABRT"
 
@@ -132,7 +125,7 @@ def make_env(n_envs: int = 1, use_async_envs: bool = False, cfg: EnvConfig | Non
     return vector(Still, n_envs)
 """
     folder = write_repository(tmp_path / "repo", code)
-    with pytest.warns(RemoteEnvWarning, match="lerobot is not installed in the jail"):
+    with pytest.warns(errors.RemoteEnvWarning, match="lerobot is not installed in the jail"):
         suites = make_env(str(folder))
     with suites:
         assert suites.provenance["installed"] is None
@@ -159,6 +152,8 @@ def test_terminals_that_are_used_up_are_told(env: Any) -> None:
     """``pty`` says 'out of pty devices'; here there is a number of them, and it is the jail's."""
     env.reset()
     code = "import os, pty\nkept = [os.openpty() for _ in range(64)]\n"
-    with pytest.raises(RemoteEnvError, match=r"out of pty devices\. A jail .* at most 64 pseudo"):
+    with pytest.raises(
+        errors.RemoteEnvError, match=r"out of pty devices\. A jail .* at most 64 pseudo"
+    ):
         env.call("run", f"{code}pty.fork()")
     env.call("run", "[os.close(fd) for pair in kept for fd in pair]")

@@ -12,13 +12,7 @@ import numpy as np
 import pytest
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
-from envhub_sandbox.errors import (
-    ActionError,
-    RemoteEnvError,
-    WorkerDiedError,
-    WorkerError,
-    WorkerTimeoutError,
-)
+from envhub_sandbox import errors
 from tests.support import inside
 from tests.support.objects.gates import DIE, LARGE, RAISE, Gates, ids, send
 
@@ -69,7 +63,7 @@ def test_whoever_raises_does_not_take_the_others_along(gates: Gates) -> None:
     send(env, 4, ids=[0], what=RAISE)
     send(env, 5, ids=[0])
     gates.open(4)
-    with pytest.raises(RemoteEnvError, match="no, at gate 4") as caught:
+    with pytest.raises(errors.RemoteEnvError, match="no, at gate 4") as caught:
         env.recv(1)
     assert caught.value.env_ids == (0,)
     gates.open(2, 3, 5)
@@ -172,13 +166,13 @@ def test_what_cannot_be_meant_is_refused(gates: Gates) -> None:
         r"it takes a list such as \[0, 3\]": [[0, 1]],
     }
     for text, env_ids in wrong.items():
-        with pytest.raises(ActionError, match=text):
+        with pytest.raises(errors.ActionError, match=text):
             send(env, *[0] * len(env_ids), ids=env_ids)
     for unreadable in ([-1], [], [[0], [0, 1]], [0.5], 1, ["0"]):
-        with pytest.raises(ActionError, match="env_ids"):
+        with pytest.raises(errors.ActionError, match="env_ids"):
             env.send(np.zeros((1, 2), np.int64), unreadable)
     for actions in (np.zeros((2, 2), np.int64), np.zeros((1, 3), np.int64), [[0.5, 0]]):
-        with pytest.raises(ActionError):
+        with pytest.raises(errors.ActionError):
             env.send(actions, [2])
     with pytest.raises(ValueError, match="`min_ready` is 0"):
         env.recv(0)
@@ -217,7 +211,7 @@ def shards(tmp_path: Path, lane: str) -> Iterator[Gates]:
 def test_workers_of_one_jail_are_ready_one_by_one(shards: Gates) -> None:
     """Without ``min_ready`` for ``make_env``, after a reset and steps of all, and before them."""
     env = shards.env(6, num_workers=3)
-    with pytest.raises(ActionError, match="env_ids lacks 1"):
+    with pytest.raises(errors.ActionError, match="env_ids lacks 1"):
         send(env, 0, ids=[0])
     send(env, 1, 0, 0, 0, 2, 2)
     assert ids(env.recv(1)) == [2, 3]
@@ -230,7 +224,7 @@ def test_workers_of_one_jail_are_ready_one_by_one(shards: Gates) -> None:
         [2, 2],
         [3, 3],
     ]
-    with pytest.raises(WorkerTimeoutError):
+    with pytest.raises(errors.WorkerTimeoutError):
         env.recv(1, timeout=0.1)
     shards.open(1)
     assert ids(env.recv()) == [0, 1]
@@ -246,7 +240,7 @@ def test_what_one_worker_of_a_jail_raises_is_its_own(shards: Gates) -> None:
     env = shards.env(2, num_workers=2)
     env.send(np.array([[0, RAISE], [1, 0]]))
     send(env, 0, ids=[0])
-    with pytest.raises(RemoteEnvError) as caught:
+    with pytest.raises(errors.RemoteEnvError) as caught:
         env.recv(1)
     assert (caught.value.env_ids, ids(env.recv(1))) == ((0,), [0])
     shards.open(1)
@@ -257,10 +251,10 @@ def test_a_death_takes_the_workers_of_a_jail_along(shards: Gates) -> None:
     """The error names all whose results are lost; what came before it is there."""
     env = shards.env(3, num_workers=3, policy={"restart": "on_reset"})
     env.send(np.array([[0, 0], [1, DIE], [2, 0]]))
-    with contextlib.suppress(WorkerTimeoutError):  # until the first has answered
+    with contextlib.suppress(errors.WorkerTimeoutError):  # until the first has answered
         env.recv(2, timeout=1)
     shards.open(1)
-    with pytest.raises(WorkerDiedError) as caught:
+    with pytest.raises(errors.WorkerDiedError) as caught:
         env.recv(2)
     assert (caught.value.env_ids, ids(env.recv())) == ((1, 2), [0])
     assert env.reset(seed=1)[0].tolist() == [[0, 1], [0, 2], [0, 3]]
@@ -272,7 +266,7 @@ def test_who_is_late_in_a_jail_holds_nobody_up_before(shards: Gates) -> None:
     with inside.hurried(env, step_s=1.0):
         send(env, 0, 1, 1)
         assert ids(env.recv(1)) == [0]
-        with pytest.raises(WorkerTimeoutError) as late:
+        with pytest.raises(errors.WorkerTimeoutError) as late:
             env.recv(1)
     assert late.value.env_ids == (1, 2)
     shards.open(1)
@@ -299,7 +293,7 @@ def test_a_fork_neither_sends_nor_receives(gates: Gates) -> None:
         for call in (lambda: env.recv(1), lambda: send(env, 0, 0), env.send_reset):
             try:
                 call()
-            except WorkerError:
+            except errors.WorkerError:
                 refused += 1
             except BaseException:
                 os._exit(9)
