@@ -16,12 +16,9 @@ from tests.compliance.differential.cases import without_members
 from tests.compliance.differential.scripted import Level, Mode
 from tests.compliance.theirs.through_sandbox import by_value, vector
 from tests.support.compare import assert_same
-from tests.support.repositories import write_repository
+from tests.support.repositories import STILL, write_repository
 
 _ENV = """
-import gymnasium as gym
-import numpy as np
-
 deep = []
 for _ in range(40):
     deep = [deep]
@@ -37,9 +34,8 @@ ODD = {
     "integer": [2 ** 10_000],
 }
 
-class Odd(gym.Env):
+class Odd(Still):
     observation_space = gym.spaces.Box(0, 100, (2,))
-    action_space = gym.spaces.Discrete(2)
 
     def reset(self, *, seed=None, options=None):
         self.n, self.odd = 0, ODD[options["odd"]]
@@ -52,16 +48,13 @@ class Odd(gym.Env):
 
     def tell(self):
         return self.odd
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Odd] * n_envs)
 """
 ODD = ("structured", "record", "void", "long", "longs", "deep", "many", "text", "integer")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_repository(tmp_path_factory.mktemp("odd"), _ENV)
+    return write_repository(tmp_path_factory.mktemp("odd"), STILL + _ENV)
 
 
 def _is_inert(value: Any) -> bool:

@@ -12,7 +12,7 @@ from envhub_sandbox import make_env
 from tests.compliance.pair import Pair
 from tests.compliance.vector_env import MODES, Case, VectorEnvCompliance, paired
 from tests.support.compare import assert_same
-from tests.support.repositories import write_repository
+from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
 
@@ -172,25 +172,17 @@ def test_results_do_not_depend_on_who_is_ready_first(
             assert_same((*wanted[:4], _own(wanted[4], 0)), found, what)
 
 
-_RAISING = """
+_RAISING = f"""{STILL}
 import time
-import gymnasium as gym
-import numpy as np
 
-class Raising(gym.Env):
+class Raising(Still):
     observation_space = action_space = gym.spaces.Discrete(3)
-
-    def reset(self, *, seed=None, options=None):
-        return 0, {}
 
     def step(self, action):
         if action == 1:
             raise ValueError("one")
         time.sleep(0.3 * (action == 2))
-        return action, 1.0, False, False, {}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Raising] * n_envs)
+        return action, 1.0, False, False, {{}}
 """
 
 

@@ -19,6 +19,7 @@ from envhub_sandbox import RemoteSandbox
 from envhub_worker.extras.access.commands import status
 from tests.support import inside
 from tests.support.processes import eventually
+from tests.support.repositories import STILL, write_repository
 
 _BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 ANY_PORT = "tcp://127.0.0.1:*"
@@ -34,10 +35,8 @@ def worker(*words: object, timeout_s: float = 120) -> subprocess.CompletedProces
 # counts its steps, so that everybody sees whether it is still the same one
 COUNTING = """
 import time
-import gymnasium as gym
-import numpy as np
 
-class Counting(gym.Env):
+class Counting(Still):
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
     action_space = gym.spaces.Discrete(100)
     def reset(self, *, seed=None, options=None):
@@ -48,16 +47,12 @@ class Counting(gym.Env):
         time.sleep(int(action) / 10)
         self.count += 1
         return np.full(1, self.count, np.float32), 0.0, False, False, {}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Counting] * n_envs)
 """
 
 
 def counting(folder: Path, *, files: dict[str, bytes] | None = None) -> Path:
     """A repository whose action says how many tenths of a second a step takes."""
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "env.py").write_text(COUNTING)
+    write_repository(folder, STILL + COUNTING)
     for name, data in (files or {}).items():
         (folder / name).write_bytes(data)
     return folder

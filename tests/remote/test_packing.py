@@ -12,6 +12,7 @@ from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.messages import compression
 from tests.remote.listening import Listening
 from tests.remote.relay import relay
+from tests.support.repositories import STILL, write_repository
 
 lz4 = pytest.importorskip("lz4.block", reason="needs lz4: pip install lz4")
 LIMITS = WireLimits(frame_bytes=1 << 20, message_bytes=2 << 20)
@@ -67,11 +68,10 @@ def test_no_size_makes_the_others_seem_small() -> None:
 
 
 def test_images_take_less_of_a_wire_than_they_hold(server: Listening, tmp_path: Path) -> None:
+    images = write_repository(tmp_path / "images", STILL + _IMAGES)
     with (
         relay(server.port) as wire,
-        make_env(
-            smooth_images(tmp_path / "images"), sandbox=server.sandbox(endpoint=wire.endpoint)
-        ) as suites,
+        make_env(images, sandbox=server.sandbox(endpoint=wire.endpoint)) as suites,
     ):
         observation, _ = suites.env.reset(seed=1)
         assert observation.shape == (1, 256, 256, 3)
@@ -83,25 +83,11 @@ def test_images_take_less_of_a_wire_than_they_hold(server: Listening, tmp_path: 
         assert wire.received - before < observation.nbytes
 
 
-def smooth_images(folder: Path) -> Path:
-    """A repository whose observations are large and plain."""
-    folder.mkdir()
-    (folder / "env.py").write_text(_IMAGES)
-    return folder
-
-
 _IMAGES = """
-import gymnasium as gym
-import numpy as np
-
-class Images(gym.Env):
+class Images(Still):
     observation_space = gym.spaces.Box(0, 255, (256, 256, 3), np.uint8)
-    action_space = gym.spaces.Discrete(2)
     def reset(self, *, seed=None, options=None):
         return np.full((256, 256, 3), 7, np.uint8), {}
     def step(self, action):
         return np.full((256, 256, 3), 7, np.uint8), 0.0, False, False, {}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Images] * n_envs)
 """

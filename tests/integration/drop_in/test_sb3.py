@@ -11,7 +11,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from envhub_sandbox.errors import RemoteProtocolError
-from tests.support.repositories import write_repository
+from tests.support.repositories import STILL, write_repository
 from tests.support.samples import make_env_of, sample
 
 torch = pytest.importorskip("torch")
@@ -67,21 +67,13 @@ def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.SyncVectorEnv([lambda: gym.wrappers.OrderEnforcing(Goals())] * n_envs)
 """
 _PARTS = """
-import gymnasium as gym
-
-class Parts(gym.Env):
+class Parts(Still):
     observation_space = gym.spaces.Discrete(9)
     action_space = gym.spaces.Dict(a=gym.spaces.Discrete(3), b=gym.spaces.Tuple(
         (gym.spaces.Box(-1, 1, (2,)), gym.spaces.MultiDiscrete([2, 3]))))
 
-    def reset(self, *, seed=None, options=None):
-        return 0, {}
-
     def step(self, action):
         return 1, 0.0, False, False, {"action": repr(action)}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Parts] * n_envs)
 """
 
 
@@ -227,7 +219,8 @@ def test_what_a_wrapper_hides_is_found_behind_it(tmp_path: Path) -> None:
 
 def test_actions_are_one_for_each(tmp_path: Path) -> None:
     """As ``DummyVecEnv`` takes them, whatever their space; numbers stay what they are."""
-    both = SandboxVecEnv.make(write_repository(tmp_path, _PARTS), n_envs=2), one_of(_PARTS)
+    parts = STILL + _PARTS
+    both = SandboxVecEnv.make(write_repository(tmp_path, parts), n_envs=2), one_of(parts)
     for env in both:
         env.action_space.seed(3)
         env.reset()

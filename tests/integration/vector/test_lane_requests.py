@@ -199,12 +199,8 @@ def test_what_comes_is_what_a_step_gives(tmp_path: Path, lane: str, count: int, 
 
 
 _ENV = """
-import gymnasium as gym
-import numpy as np
-
-class Large(gym.Env):
+class Large(Still):
     observation_space = gym.spaces.Box(0, 255, (SIZE,), np.uint8)
-    action_space = gym.spaces.Discrete(2)
 
     def reset(self, *, seed=None, options=None):
         return np.zeros(SIZE, np.uint8), {}
@@ -214,14 +210,11 @@ class Large(gym.Env):
 
     def large(self, size):
         return np.zeros(size, np.uint8)
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Large] * n_envs)
 """
 
 
 def _repository(folder: Path, size: int) -> Path:
-    return write_repository(folder, _ENV.replace("SIZE", str(size)))
+    return write_repository(folder, STILL + _ENV.replace("SIZE", str(size)))
 
 
 @pytest.mark.parametrize("lane", ["auto", "frames"])

@@ -13,7 +13,7 @@ from envhub_sandbox.cli.shared.exits import Exit
 from tests.remote.listening import Listening, counting
 from tests.support.elsewhere.kit import SYSTEMS, command, elsewhere, ran
 from tests.support.processes import eventually
-from tests.support.repositories import write_repository
+from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
 pytestmark = pytest.mark.parametrize("system", SYSTEMS)
@@ -49,9 +49,8 @@ print(sys.platform)
 """
 _DIES = """
 import os
-import gymnasium as gym
 
-class Dies(gym.Env):
+class Dies(Still):
     observation_space = action_space = gym.spaces.Discrete(10)
     offset = count = 0
     def number(self):
@@ -65,9 +64,6 @@ class Dies(gym.Env):
             os._exit(3)
         self.count += 1
         return 0, float(self.count), False, False, {}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Dies] * n_envs)
 """
 _INTERRUPTED = f"""{_CONNECT}
 import numpy as np, time
@@ -102,7 +98,7 @@ def test_the_tests_of_clients_pass(system: str) -> None:
 
 def test_it_lives_dies_and_starts_again(system: str, server: Listening, tmp_path: Path) -> None:
     """Reset, step, call, set_attr, a death, a restart, and two closes."""
-    repository = write_repository(tmp_path / "repo", _DIES)
+    repository = write_repository(tmp_path / "repo", STILL + _DIES)
     said = elsewhere(system, _LIFE, *words(server), repository)
     assert said.split() == ["WorkerDiedError", system]
 
@@ -216,7 +212,7 @@ def test_a_client_leaves_only_its_cache(system: str, server: Listening, tmp_path
     home, temporary = tmp_path / "home", tmp_path / "temporary"
     temporary.mkdir()
     folders = {"HOME": str(home), "TMPDIR": str(temporary), "ENVHUB_CACHE": ""}
-    repository = write_repository(tmp_path / "repo", _DIES)
+    repository = write_repository(tmp_path / "repo", STILL + _DIES)
     elsewhere(system, _LIFE, *words(server), repository, **folders)
     assert not list(temporary.iterdir())
     cache = {"darwin": "Library/Caches/envhub-sandbox", "win32": "AppData/Local/envhub-sandbox"}

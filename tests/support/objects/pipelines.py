@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 
 from envhub_sandbox.errors import RemoteEnvError
-from tests.support.repositories import write_repository
+from tests.support.repositories import STILL, write_repository
 
 _REPOSITORY = """
 import warnings
-import gymnasium as gym
-import numpy as np
 
-class Changing(gym.Env):
+class Changing(Still):
     observation_space = gym.spaces.Box(-np.inf, np.inf, (SIZE,), np.float32)
     action_space = gym.spaces.Discrete(7)
 
@@ -46,9 +44,6 @@ class Changing(gym.Env):
             warnings.warn(f"at {self.count}")
         info = infos[int(action) % 5]
         return self.seen(), float(self.count), self.count % 17 == 0, False, info
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Changing] * n_envs)
 """
 _DEPTHS = (0, 0, 3, 0, 2, 2, 0, 0, 0, 5, 1, 1, 4, 0, 16, 0, 0)
 """How many steps are on their way, from one part of a run to the next; 0: ``step``."""
@@ -58,7 +53,7 @@ _STEPS = 12
 
 def changing(folder: Path, size: int) -> str:
     """A repository whose infos change from step to step, as its actions say."""
-    return str(write_repository(folder, _REPOSITORY.replace("SIZE", str(size))))
+    return str(write_repository(folder, STILL + _REPOSITORY.replace("SIZE", str(size))))
 
 
 def one_by_one(env: Any) -> list[Any]:
