@@ -5,6 +5,7 @@ import ctypes
 import fcntl
 import mmap
 import os
+import re
 import select
 import socket
 import struct
@@ -22,7 +23,8 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
 def memory_bomb(kind, size):
-    taken = [_TAKERS[kind]() for _ in range(size // _PIECE)]
+    take = globals()["_" + re.sub(r"\W+", "_", kind).lower()]
+    taken = [take() for _ in range(size // _PIECE)]
     kept.append(taken)
     if kind in _FOLDERS:
         return taken
@@ -33,9 +35,9 @@ def _heap():
     return b"x" * _PIECE
 
 
-def _shared():
-    area = mmap.mmap(-1, _PIECE, flags=mmap.MAP_SHARED | mmap.MAP_ANONYMOUS)
-    area.write(b"x" * _PIECE)
+def _shared(size=_PIECE):
+    area = mmap.mmap(-1, size, flags=mmap.MAP_SHARED | mmap.MAP_ANONYMOUS)
+    area.write(b"x" * size)
     return area
 
 
@@ -45,7 +47,7 @@ def _memfd():
     return fd
 
 
-def _memfd_without_descriptor():
+def _memfd_without_a_descriptor():
     fd = _memfd()
     area = mmap.mmap(fd, _PIECE)
     os.close(fd)
@@ -54,25 +56,19 @@ def _memfd_without_descriptor():
 
 def _shared_in_small_pieces():
     """Below whatever size might be looked at."""
-    return [_shared_piece() for _ in range(_PIECE // _SMALL)]
+    return [_shared(_SMALL) for _ in range(_PIECE // _SMALL)]
 
 
-def _shared_piece():
-    area = mmap.mmap(-1, _SMALL, flags=mmap.MAP_SHARED | mmap.MAP_ANONYMOUS)
-    area.write(b"x" * _SMALL)
-    return area
-
-
-def _shared_out_of_sight():
+def _shared_out_of_the_page_tables():
     """Its pages leave the page tables, and are there."""
     area = _shared()
     area.madvise(mmap.MADV_DONTNEED)
     return area
 
 
-def _shared_but_unmapped():
+def _shared_unmapped_but_for_a_page():
     """One page of it is mapped, and keeps the others."""
-    pieces = [_shared_piece() for _ in range(_PIECE // _SMALL)]
+    pieces = _shared_in_small_pieces()
     for area in pieces:
         address = ctypes.addressof(ctypes.c_char.from_buffer(area))
         _checked(_LIBC.munmap(ctypes.c_void_p(address + _PAGE), ctypes.c_size_t(_SMALL - _PAGE)))
@@ -85,7 +81,7 @@ def _checked(result):
     return result
 
 
-def _copies_of_a_file():
+def _copies_of_a_file_s_pages():
     """Changed pages of a file that has no blocks of its own."""
     with tempfile.TemporaryFile() as file:
         os.ftruncate(file.fileno(), _PIECE)
@@ -120,8 +116,7 @@ def _mappings():
 
 
 def _semaphores():
-    number = _LIBC.semget
-    return [_checked(number(_IPC_PRIVATE, 500, 0o1600)) for _ in range(_PIECE // (32 << 10))]
+    return [_checked(_LIBC.semget(_IPC_PRIVATE, 500, 0o1600)) for _ in range(_PIECE // (32 << 10))]
 
 
 def _messages():
@@ -243,8 +238,7 @@ def _system_v():
 
 def _pipes():
     """What pipes hold belongs to no process's memory."""
-    held = 0
-    pipes = []
+    held, pipes = 0, []
     while held < _PIECE:
         read, write = os.pipe2(os.O_NONBLOCK)
         held += os.write(write, b"x" * 65536)
@@ -273,31 +267,6 @@ def _in_child(take):
     return pid
 
 
-_TAKERS = {
-    "heap": _heap,
-    "shared": _shared,
-    "memfd": _memfd,
-    "memfd in flight": _memfd_in_flight,
-    "memfd without a descriptor": _memfd_without_descriptor,
-    "shared, in small pieces": _shared_in_small_pieces,
-    "shared, out of the page tables": _shared_out_of_sight,
-    "shared, unmapped but for a page": _shared_but_unmapped,
-    "copies of a file's pages": _copies_of_a_file,
-    "page tables": _page_tables,
-    "mappings": _mappings,
-    "semaphores": _semaphores,
-    "messages": _messages,
-    "sockets": _sockets,
-    "sockets in flight": _sockets_in_flight,
-    "epoll watches": _epoll_watches,
-    "file locks": _file_locks,
-    "empty folders": _empty_folders,
-    "attributes of files": _attributes_of_files,
-    "access lists": _access_lists,
-    "System V": _system_v,
-    "children": _children,
-    "pipes": _pipes,
-}
 #: Their numbers, or paths, are needed to remove them.
 _FOLDERS = ("empty folders", "attributes of files", "access lists")
 _LEFT_BEHIND = ("semaphores", "messages")

@@ -15,9 +15,15 @@ kept = []
 _heard = {"bytes": b""}
 
 
+def _stream(family, address, message, protocol=0):
+    with socket.socket(family, socket.SOCK_STREAM, protocol) as sender:
+        sender.settimeout(5)
+        sender.connect(address)
+        sender.sendall(message.encode())
+
+
 def tcp(host, port, message):
-    with socket.create_connection((host, port), timeout=5) as connection:
-        connection.sendall(message.encode())
+    _stream(socket.AF_INET6 if ":" in host else socket.AF_INET, (host, port), message)
 
 
 def tcp_fast_open(host, port, message):
@@ -28,9 +34,7 @@ def tcp_fast_open(host, port, message):
 
 def mptcp(host, port, message):
     """Connect with multipath TCP, which rules about TCP do not see."""
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM, _IPPROTO_MPTCP) as sender:
-        sender.connect((host, port))
-        sender.sendall(message.encode())
+    _stream(socket.AF_INET, (host, port), message, _IPPROTO_MPTCP)
 
 
 def udp(host, port, message):
@@ -69,19 +73,12 @@ def packet(device, message):
 
 
 def vsock(cid, port, message):
-    with socket.socket(socket.AF_VSOCK, socket.SOCK_STREAM) as sender:
-        sender.settimeout(5)
-        sender.connect((cid, port))
-        sender.sendall(message.encode())
+    _stream(socket.AF_VSOCK, (cid, port), message)
 
 
 def unix_stream(path, message):
     """Connect to a socket file, as one does to docker, an ssh agent or a desktop's bus."""
-    address = "\0" + path[1:] if path.startswith("@") else path
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sender:
-        sender.settimeout(5)
-        sender.connect(address)
-        sender.sendall(message.encode())
+    _stream(socket.AF_UNIX, "\0" + path[1:] if path.startswith("@") else path, message)
 
 
 def unix_datagram(path, message):

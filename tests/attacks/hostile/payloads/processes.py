@@ -66,19 +66,20 @@ def ptrace_poke(pid, address, word):
         syscall("ptrace", _DETACH, pid, 0, 0)
 
 
-def process_vm_read(pid, address, size):
-    buffer = ctypes.create_string_buffer(size)
+def _process_vm(way, pid, address, buffer, size):
     ours = (ctypes.c_ulong * 2)(ctypes.addressof(buffer), size)
     theirs = (ctypes.c_ulong * 2)(address, size)
-    syscall("process_vm_readv", pid, ours, 1, theirs, 1, 0)
+    syscall(f"process_vm_{way}v", pid, ours, 1, theirs, 1, 0)
     return buffer.raw.decode("ascii", "replace")
+
+
+def process_vm_read(pid, address, size):
+    return _process_vm("read", pid, address, ctypes.create_string_buffer(size), size)
 
 
 def process_vm_write(pid, address, message):
     buffer = ctypes.create_string_buffer(message.encode())
-    ours = (ctypes.c_ulong * 2)(ctypes.addressof(buffer), len(message))
-    theirs = (ctypes.c_ulong * 2)(address, len(message))
-    syscall("process_vm_writev", pid, ours, 1, theirs, 1, 0)
+    _process_vm("write", pid, address, buffer, len(message))
 
 
 def proc_mem_read(pid, address, size):
@@ -224,26 +225,23 @@ def grandchildren(alias, seconds):
 def setuid_program(command, uid):
     """Run a program that belongs to another user and takes on its rights, and let it stand."""
     user = {} if uid is None else {"user": uid}
-    kept.append(
-        subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            **user,
-        )
-    )
+    silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    kept.append(subprocess.Popen(command, stdin=subprocess.PIPE, **silent, **user))
     return kept[-1].pid
 
 
 def write_to_terminal(text, ways):
     """Write to the terminal that the client was started from."""
+    return _first(
+        ways, lambda way: os.write(os.open(way, os.O_WRONLY | os.O_NOCTTY), text.encode())
+    )
+
+
+def _first(ways, act):
     errors = []
     for way in ways:
         try:
-            fd = os.open(way, os.O_WRONLY | os.O_NOCTTY)
-            os.write(fd, text.encode())
-            return "written"
+            return act(way)
         except OSError as error:
             errors.append(str(error))
     return errors
@@ -251,13 +249,10 @@ def write_to_terminal(text, ways):
 
 def type_into_terminal(text):
     """Type a command into the terminal that the client was started from."""
-    errors = []
-    for way in ("/dev/tty", 0, 1, 2):
-        try:
-            fd = os.open(way, os.O_RDWR | os.O_NOCTTY) if isinstance(way, str) else way
-            for letter in text:
-                fcntl.ioctl(fd, termios.TIOCSTI, letter.encode())
-            return "typed"
-        except OSError as error:
-            errors.append(str(error))
-    return errors
+
+    def typed(way):
+        fd = os.open(way, os.O_RDWR | os.O_NOCTTY) if isinstance(way, str) else way
+        for letter in text:
+            fcntl.ioctl(fd, termios.TIOCSTI, letter.encode())
+
+    return _first(("/dev/tty", 0, 1, 2), typed)
