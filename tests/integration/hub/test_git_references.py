@@ -5,18 +5,16 @@ import pickle
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from envhub_sandbox import make_env
-from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import LoadError, RepositoryUnavailableError, SnapshotTooLargeError
 from envhub_sandbox.extras.packages.locks.day import written
 from envhub_sandbox.extras.sources import git_address as address
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import SnapshotLimits, fetch, snapshot_named
+from tests.support.command_line import document, envhub
 from tests.support.packages.git_server import commit, git, git_served, make_repository
 from tests.support.repositories import CARTPOLE, CARTPOLES
 
@@ -45,12 +43,6 @@ def ref(repository: Path, tmp_path: Path) -> Iterator[str]:
     """Its reference without a revision, as long as it is served."""
     with git_served(tmp_path / "served") as where:
         yield f"git+{where}/org/repo"
-
-
-def envhub(*arguments: str, code: int = 0) -> dict[str, Any]:
-    done = CliRunner().invoke(app, [*arguments, "--json"])
-    assert done.exit_code == code, done.output
-    return dict(json.loads(done.stdout))
 
 
 _RUNS_A_PROGRAM = f"""
@@ -133,14 +125,14 @@ def test_commands_know_it(ref: str, repository: Path, tmp_path: Path) -> None:
     pin = f"{ref}@{git(repository, 'rev-parse', 'v1^{commit}')}:envs/env.py"
     newest = f"{ref}@{git(repository, 'rev-parse', 'main')}:envs/env.py"
     lock = str(tmp_path / "pylock.x.toml")
-    assert envhub("lock", pin, "-o", lock, "--no-spaces")["reference"] == pin
-    assert envhub("lock", "--check", lock, "--no-index", "--no-spaces")["drift"] == []
-    drift = envhub("lock", "--check", lock, newest, "--no-index", "--no-spaces", code=7)["drift"]
+    assert document("lock", pin, "-o", lock, "--no-spaces")["reference"] == pin
+    assert document("lock", "--check", lock, "--no-index", "--no-spaces")["drift"] == []
+    drift = document("lock", "--check", lock, newest, "--no-index", "--no-spaces", code=7)["drift"]
     assert "file later.txt: new" in drift
-    changes = envhub("diff", pin, newest, code=7)
+    changes = document("diff", pin, newest, code=7)
     assert "later.txt" in json.dumps(changes)
-    assert envhub("inspect", pin)["provenance"]["repo_type"] == "git"
-    judged = CliRunner().invoke(app, ["check", f"{ref}@main:envs/env.py", "--steps", "20"])
-    assert "can mean another commit" in " ".join(judged.output.split())
-    listed = [one["repository"] for one in envhub("cache", "list")["snapshots"]]
+    assert document("inspect", pin)["provenance"]["repo_type"] == "git"
+    judged = envhub("check", f"{ref}@main:envs/env.py", "--steps", "20")
+    assert "can mean another commit" in " ".join((judged.stdout + judged.stderr).split())
+    listed = [one["repository"] for one in document("cache", "list")["snapshots"]]
     assert set(listed) == {ref}

@@ -6,12 +6,11 @@ from typing import Any
 
 import gymnasium
 import pytest
-from typer.testing import CliRunner
 
 from envhub_sandbox import make_env
-from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import LoadError, WorkerDiedError
 from envhub_sandbox.extras.crash.bundle_reader import load_bundle
+from tests.support.command_line import document, envhub
 from tests.support.compare import assert_same, rolled
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
@@ -84,12 +83,6 @@ def packages(real_index: Index) -> Index:
     return real_index
 
 
-def envhub(*arguments: str, code: int = 0) -> dict[str, Any]:
-    done = CliRunner().invoke(app, [*arguments, "--json"])
-    assert done.exit_code == code, done.output
-    return dict(json.loads(done.stdout))
-
-
 @pytest.fixture(scope="module")
 def here() -> dict[str, Any]:
     namespace: dict[str, Any] = {}
@@ -160,20 +153,20 @@ def test_a_package_or_version_that_is_not_there(packages: Index) -> None:
 def test_commands_know_it(packages: Index, tmp_path: Path) -> None:
     ref, newer = "pypi:walled@1.0#Walled/Other-v0", "pypi:walled#Walled/Other-v0"
     lock = str(tmp_path / "pylock.x.toml")
-    locked = envhub("lock", ref, "-o", lock)
+    locked = document("lock", ref, "-o", lock)
     assert locked["reference"] == ref
     assert "walled==1.0" in locked["packages"]
-    assert envhub("lock", "--check", lock)["drift"] == []
-    assert envhub("lock", "--check", lock, newer, "--no-spaces", code=7)["drift"]
-    assert "walled" in json.dumps(envhub("diff", ref, newer, code=7))
-    assert envhub("inspect", ref)["provenance"]["repo_type"] == "pypi"
-    played = envhub("run", ref, "--episodes", "1", "--steps", "5")
+    assert document("lock", "--check", lock)["drift"] == []
+    assert document("lock", "--check", lock, newer, "--no-spaces", code=7)["drift"]
+    assert "walled" in json.dumps(document("diff", ref, newer, code=7))
+    assert document("inspect", ref)["provenance"]["repo_type"] == "pypi"
+    played = document("run", ref, "--episodes", "1", "--steps", "5")
     assert played["provenance"]["repository"] == ref.removeprefix("pypi:")
-    judged = CliRunner().invoke(app, ["check", newer, "--steps", "20"])
-    said = " ".join(judged.output.split())
+    judged = envhub("check", newer, "--steps", "20")
+    said = " ".join((judged.stdout + judged.stderr).split())
     assert "another commit or version tomorrow" in said
     assert "licence" not in said
-    listed = [one["repository"] for one in envhub("cache", "list")["snapshots"]]
+    listed = [one["repository"] for one in document("cache", "list")["snapshots"]]
     assert {ref, newer} <= set(listed)
 
 
@@ -186,5 +179,4 @@ def test_a_crash_bundle_has_it(packages: Index, tmp_path: Path) -> None:
             suites.env.step(suites.env.action_space.sample())
     [folder] = [path.parent for path in tmp_path.rglob("bundle.json")]
     assert load_bundle(folder).reference == ref
-    replayed = CliRunner().invoke(app, ["replay", "--grant", str(folder)])
-    assert replayed.exit_code == 0, replayed.output
+    envhub("replay", "--grant", str(folder), code=0)
