@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import psutil
 import pytest
@@ -23,7 +24,7 @@ from envhub_worker.extras.access.quotas import BusyError, Quotas
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
 from tests.remote.listening import Listening, listening
-from tests.support.command_line import below, gone
+from tests.support.command_line import below, gone, python
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.processes import eventually
@@ -132,13 +133,7 @@ def test_without_the_program_that_makes_them_it_does_not_start(tmp_path: Path) -
         "from envhub_worker.__main__ import main\nsys.exit(main())\n"
     )
     words = ("listen", "--bind", "tcp://127.0.0.1:*", "--insecure-loopback", "--dependencies")
-    done = subprocess.run(
-        [sys.executable, "-I", str(lacking), *words, "--state-dir", str(tmp_path / "state")],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 2
+    done = python("-I", lacking, *words, "--state-dir", tmp_path / "state", code=2)
     assert "pip install envhub-sandbox" in done.stderr
 
 
@@ -162,8 +157,8 @@ def idle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Packages]:
 def test_orders_are_bounded(idle: Packages, monkeypatch: pytest.MonkeyPatch) -> None:
     """One key has so many at once, and so many in an hour; another has its own."""
     for number in range(server_side.MAX_WAITING):
-        assert idle.need(b"a", order(f"p{number}"), ()).state == "making"
-        assert idle.need(b"a", order(f"p{number}"), ()).state == "making"
+        for _ in range(2):
+            assert idle.need(b"a", order(f"p{number}"), ()).state == "making"
     with pytest.raises(BusyError, match="wait already") as caught:
         idle.need(b"a", order("another"), ())
     assert caught.value.missing == "packages"
@@ -198,24 +193,21 @@ def test_what_nobody_asks_for_is_given_up(idle: Packages, monkeypatch: pytest.Mo
 def test_nobody_holds_others_who_have_room(idle: Packages, monkeypatch: pytest.MonkeyPatch) -> None:
     """A key has one program at work, all together a few; who waits hears how many are before."""
     monkeypatch.setattr(server_side, "MAX_AT_WORK", 2)
-    begun, command = [], server_side.command
-
-    def counted() -> list[str]:
-        begun.append(True)
-        return command()
-
-    monkeypatch.setattr(server_side, "command", counted)
+    begun = Mock(side_effect=server_side.command)
+    monkeypatch.setattr(server_side, "command", begun)
 
     def progress(key: bytes, name: str) -> str:
         reply = idle.need(key, order(name), ())
         assert reply.state == "making"
         return reply.progress
 
-    assert (progress(b"a", "first"), len(begun)) == ("at work", 1)
-    assert (progress(b"a", "second"), len(begun)) == ("waiting for other packages of your key", 1)
-    assert (progress(b"b", "first"), len(begun)) == ("at work", 2)
-    assert progress(b"c", "first") == "waiting for others' packages: 0 before it, 2 at work"
-    assert len(begun) == 2
+    for key, name, said, count in (
+        (b"a", "first", "at work", 1),
+        (b"a", "second", "waiting for other packages of your key", 1),
+        (b"b", "first", "at work", 2),
+        (b"c", "first", "waiting for others' packages: 0 before it, 2 at work", 2),
+    ):
+        assert (progress(key, name), begun.call_count) == (said, count)
 
 
 def test_an_order_that_takes_long_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -238,13 +230,6 @@ def test_an_order_that_takes_long_is_ended(tmp_path: Path, monkeypatch: pytest.M
         assert eventually(is_refused)
 
 
-def silent_index() -> socket.socket:
-    """It takes connections and says nothing: whoever asks it waits."""
-    index = socket.create_server(("127.0.0.1", 0), backlog=64)
-    index.settimeout(90)
-    return index
-
-
 _SERVER = """
 import sys, time
 from pathlib import Path
@@ -261,7 +246,9 @@ time.sleep(600)
 def test_the_program_and_its_uv_end_with_who_started_them(killed: str, tmp_path: Path) -> None:
     """Also where that was killed: nobody would measure what they take, and nobody waits for it."""
     with contextlib.ExitStack() as stack:
-        index = stack.enter_context(silent_index())
+        # it takes connections and says nothing: whoever asks it waits
+        index = stack.enter_context(socket.create_server(("127.0.0.1", 0), backlog=64))
+        index.settimeout(90)
         url = f"http://127.0.0.1:{index.getsockname()[1]}/simple"
         # what else chooses an index, as other tests' variables do, is not to be asked first
         kept = {k: v for k, v in os.environ.items() if not k.startswith(("UV_", "PIP_"))}
@@ -287,18 +274,13 @@ def test_a_program_that_cannot_be_started_is_not_tried_for_ever(
     idle: Packages, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whoever asked hears it; the server, whose tick begins what waits, does not fail with it."""
-    tried = []
-
-    def missing() -> list[str]:
-        tried.append(True)
-        return ["/nowhere/at/all"]
-
+    missing = Mock(return_value=["/nowhere/at/all"])
     monkeypatch.setattr(server_side, "command", missing)
     for _ in range(2):
         with pytest.raises(RefusedError, match="cannot be started"):
             idle.need(b"a", order("first"), ())
         idle.look(())
-    assert len(tried) == 1
+    assert missing.call_count == 1
 
 
 def test_packages_have_names_that_were_given(idle: Packages) -> None:

@@ -6,7 +6,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -15,15 +14,13 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
-from typer.testing import CliRunner
 
-from envhub_sandbox.cli.app import app
 from envhub_sandbox.extras.judge.command.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.extras.sources import parser
 from envhub_worker.protocol.text import duration_text
 from tests.corpus.entries import Entry
 from tests.hub.stub_hub import StubHub
-from tests.support.command_line import envhub
+from tests.support.command_line import COMMAND, document
 from tests.support.packages.wheels import Index
 from tests.support.processes import descendants, eventually
 from tests.support.repositories import STILL, write_repository
@@ -59,7 +56,7 @@ def judged(
     Its files are left in the folder."""
     files = [f"--{kind}={folder / kind}" for kind in ("junit", "sarif", "html")]
     words = ["check", "--json", *files, "--steps", "5", "--deadline", _LONG_S, *arguments]
-    command = [sys.executable, "-I", "-m", "envhub_sandbox", *map(str, words)]
+    command = [*COMMAND, *map(str, words)]
     with (
         (folder / "out").open("w+") as out,
         subprocess.Popen(command, stdout=out, stderr=subprocess.PIPE, text=True) as process,
@@ -109,14 +106,14 @@ def test_a_jail_that_hangs_is_ended(place: str, tmp_path: Path) -> None:
     """While it loads, resets or steps; nothing of it is left, and what was read is reported."""
     folder = hanging(tmp_path, place)
     before = descendants()
-    code, document = judged(tmp_path, folder, reached=hangs_now)
+    code, found = judged(tmp_path, folder, reached=hangs_now)
     assert code == 10
     at = "loading it" if place == "LOAD" else "a / 0"
-    says_so(tmp_path, document, at=at, lacks={"runs", "seeding", "leaks-memory"})
-    assert {"card", "licence"} < {one["check"] for one in document["findings"]}
+    says_so(tmp_path, found, at=at, lacks={"runs", "seeding", "leaks-memory"})
+    assert {"card", "licence"} < {one["check"] for one in found["findings"]}
     if place != "LOAD":
-        assert document["unjudged"]["tasks"] == ["a / 0", "a / 1"]
-        assert document["confinement"]["profile"] == "strict"
+        assert found["unjudged"]["tasks"] == ["a / 0", "a / 1"]
+        assert found["confinement"]["profile"] == "strict"
     assert eventually(lambda: descendants() <= before)
 
 
@@ -125,9 +122,9 @@ def test_what_fails_before_the_deadline_fails(tmp_path: Path) -> None:
     folder = hanging(tmp_path, "STEP")
     (folder / "other.py").write_text("text = 'a\u202eb'\n", encoding="utf-8")
     options = ["--fail-on", "warning"]
-    code, document = judged(tmp_path, folder, *options, reached=hangs_now)
+    code, found = judged(tmp_path, folder, *options, reached=hangs_now)
     assert code == 1
-    fails = {one["check"] for one in document["findings"] if one["fails"]}
+    fails = {one["check"] for one in found["findings"] if one["fails"]}
     assert fails == {"deadline", "source-hidden"}
 
 
@@ -141,25 +138,21 @@ def test_a_hanging_download_ends(stub_hub: StubHub, snapshot_store: Path, tmp_pa
     stub_hub.add("org/slow", {"env.py": _ENV})
     pattern = r"GET .*env\.py"
     stub_hub.fail(pattern, 200, pieces=trickle)
-    endpoint = ["--endpoint", stub_hub.endpoint]
-    code, document = judged(
-        tmp_path,
-        "org/slow",
-        *endpoint,
-        reached=lambda: any(re.search(pattern, one) for one in stub_hub.requests),
-    )
+    words = ["org/slow", "--endpoint", stub_hub.endpoint]
+    asked = lambda: any(re.search(pattern, one) for one in stub_hub.requests)  # noqa: E731
+    code, found = judged(tmp_path, *words, reached=asked)
     assert code == 10
-    says_so(tmp_path, document, at="reading org/slow", lacks={"loads", "licence", "requirements"})
-    assert document["reference"] == "org/slow"
+    says_so(tmp_path, found, at="reading org/slow", lacks={"loads", "licence", "requirements"})
+    assert found["reference"] == "org/slow"
 
 
 def test_packages_that_do_not_come_are_ended(index: Index, tmp_path: Path) -> None:
     index.hold("/simple")
     folder = write_repository(tmp_path / "slow", _ENV, requirements__txt="not-here==1\n")
-    code, document = judged(tmp_path, folder, reached=index.held)
+    code, found = judged(tmp_path, folder, reached=index.held)
     assert code == 10
     at = "reading and installing what it declares"
-    says_so(tmp_path, document, at=at, lacks={"requirements", "imports", "loads"})
+    says_so(tmp_path, found, at=at, lacks={"requirements", "imports", "loads"})
 
 
 def test_a_parser_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,10 +162,8 @@ def test_a_parser_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(parser, "__file__", str(program))
     folder = write_repository(tmp_path / "slow", _ENV)
     before = descendants()
-    done = CliRunner().invoke(app, ["check", str(folder), "--deadline", "2", "--json"])
-    assert done.exit_code == 10, done.output
-    checks = json.loads(done.stdout)["unjudged"]["checks"]
-    assert {"source-hidden", "loads"} < set(checks)
+    found = document("check", folder, "--deadline", "2", code=10)
+    assert {"source-hidden", "loads"} < set(found["unjudged"]["checks"])
     assert eventually(lambda: descendants() <= before)
 
 
@@ -187,12 +178,11 @@ def test_one_of_a_list_ends_no_other(tmp_path: Path) -> None:
     folder = hanging(tmp_path, "STEP")
     Entry(group="honest").write(tmp_path / "quick")
     (tmp_path / "list").write_text(f"{folder}\n{tmp_path / 'quick'}\n")
-    short = ("--steps", "2", "--resets", "0", "--deadline", str(_LONG_S), "--json")
+    short = ("--steps", "2", "--resets", "0", "--deadline", str(_LONG_S))
     alarm = threading.Thread(target=ring_once_it_hangs)
     alarm.start()
-    done = envhub("check", "--all", tmp_path / "list", *short, code=10)
+    late, quick = document("check", "--all", tmp_path / "list", *short, code=10)["results"]
     alarm.join()
-    late, quick = json.loads(done.stdout)["results"]
     assert (late["verdict"], quick["verdict"]) == ("not judged", "passed")
     assert f"ended after {duration_text(_LONG_S)}, at: " in late["report"]["findings"][0]["message"]
     assert late["report"]["unjudged"]["tasks"]

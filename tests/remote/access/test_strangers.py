@@ -8,6 +8,7 @@ import struct
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import psutil
@@ -85,10 +86,9 @@ def test_a_refusal_between_looking_and_sending_is_no_wait(
 
 def test_another_servers_key_is_refused_at_once(server: Listening, repository: Path) -> None:
     other = key_text(keys.generate().public)
-    with pytest.raises(
-        SandboxUnavailableError, match=r"another public key than the given\s+server_key"
-    ):
-        make_env(repository, sandbox=server.sandbox(server_key=other))
+    wrong = server.sandbox(server_key=other)
+    with pytest.raises(SandboxUnavailableError, match=r"another public key than the given\s+serv"):
+        make_env(repository, sandbox=wrong)
     assert eventually(lambda: "handshake_failed" in server.said())
     with pytest.raises(SandboxUnavailableError, match="does not speak ZeroMQ with CURVE"):
         make_env(repository, sandbox=server.sandbox(server_key=None, insecure_loopback=True))
@@ -214,9 +214,8 @@ def may_filter() -> bool:
     return True
 
 
-needs_a_filter = pytest.mark.skipif(
-    not may_filter(), reason="this user may not filter what a TCP socket gets"
-)
+REASON = "this user may not filter what a TCP socket gets"
+needs_a_filter = pytest.mark.skipif(not may_filter(), reason=REASON)
 
 
 @needs_a_filter
@@ -257,7 +256,8 @@ def test_a_door_that_cannot_be_shut_ends_nothing(monkeypatch: pytest.MonkeyPatch
         router.bind("tcp://127.0.0.1:*")
         for broken in ("os.listdir", "os.dup"):
             with monkeypatch.context() as patch:
-                patch.setattr(broken, _no_descriptors)
+                full = OSError(errno.EMFILE, "Too many open files")
+                patch.setattr(broken, Mock(side_effect=full))
                 inside.happen(doorman, zmq.EVENT_ACCEPTED)
             assert not inside.door_is_shut(doorman)
         assert "and no end" in said[0]
@@ -268,10 +268,6 @@ def test_a_door_that_cannot_be_shut_ends_nothing(monkeypatch: pytest.MonkeyPatch
         doorman.tick()
         assert not inside.door_is_shut(doorman)
         doorman.close()
-
-
-def _no_descriptors(*_: object) -> None:
-    raise OSError(errno.EMFILE, "Too many open files")
 
 
 def test_without_keys_it_listens_on_loopback_only(tmp_path: Path, repository: Path) -> None:
@@ -286,9 +282,9 @@ def test_without_keys_it_listens_on_loopback_only(tmp_path: Path, repository: Pa
             listening(tmp_path / "closed", "--insecure-loopback", bind=f"tcp://{address}:*"),
         ):
             pass
-    elsewhere = "tcp://192.0.2.1:5555"
+    elsewhere = {"endpoint": "tcp://192.0.2.1:5555", "server_key": None}
     with pytest.raises(PolicyError, match="not on a loopback address"):
-        open_server.sandbox(endpoint=elsewhere, server_key=None, insecure_loopback=True)
+        open_server.sandbox(**elsewhere, insecure_loopback=True)
 
 
 def test_a_key_that_is_taken_off_the_list_is_out(tmp_path: Path, repository: Path) -> None:
