@@ -31,7 +31,7 @@ def parse(line: bytes) -> Surroundings:
         ) from error
 
 
-def profile_for(wanted: str, found: Surroundings) -> str:
+def profile_for(wanted: str, surroundings: Surroundings) -> str:
     """The profile of jails in a container where the policy names ``wanted``.
 
     The container's own walls stand around every jail. So ``"strict"`` takes the strongest that can
@@ -40,15 +40,15 @@ def profile_for(wanted: str, found: Surroundings) -> str:
     Raises ``SandboxUnavailableError``: it cannot be had.
     """
     if wanted != "strict":
-        if wanted in found.profiles:
+        if wanted in surroundings.profiles:
             return wanted
         raise SandboxUnavailableError(
             f"the profile {wanted!r} cannot be had in this container; it can give "
-            f"{', '.join(found.profiles) or 'none'}"
+            f"{', '.join(surroundings.profiles) or 'none'}"
         )
-    if "strict" in found.profiles:
+    if "strict" in surroundings.profiles:
         return "strict"
-    if "container" in found.profiles and found.landlock >= 1:
+    if "container" in surroundings.profiles and surroundings.landlock >= 1:
         return "container"
     raise SandboxUnavailableError(
         "this container permits neither namespaces nor Landlock, so only a system call filter "
@@ -57,37 +57,41 @@ def profile_for(wanted: str, found: Surroundings) -> str:
     )
 
 
-def layers(wanted: Container, found: Surroundings, title: str) -> list[dict[str, Any]]:
+def layers(wanted: Container, surroundings: Surroundings, title: str) -> list[dict[str, Any]]:
     """What holds around every jail, for the report.
     ``title``: engine and image, for the first line.
     Raises ``SandboxUnavailableError``: something that was asked for does not hold.
     """
     checks: Sequence[tuple[str, bool, str]] = (
-        ("container-user", found.user == wanted.user[0] != 0, f"user {found.user}, not root"),
-        ("container-capabilities", found.capabilities == 0, "none in any set"),
-        ("container-privileges", found.no_new_privileges, "no new ones can be gained"),
-        ("container-files", found.read_only, "a read-only root, the snapshot, and scratch"),
-        *_chosen(wanted, found),
+        (
+            "container-user",
+            surroundings.user == wanted.user[0] != 0,
+            f"user {surroundings.user}, not root",
+        ),
+        ("container-capabilities", surroundings.capabilities == 0, "none in any set"),
+        ("container-privileges", surroundings.no_new_privileges, "no new ones can be gained"),
+        ("container-files", surroundings.read_only, "a read-only root, the snapshot, and scratch"),
+        *_chosen(wanted, surroundings),
     )
     for layer, holds, _ in checks:
         if not holds:
-            raise _does_not_hold(layer, wanted, found)
+            raise _does_not_hold(layer, wanted, surroundings)
     report = [{"layer": "container", "enforced": True, "detail": title}]
     report += [{"layer": name, "enforced": True, "detail": detail} for name, _, detail in checks]
     return [*report, *_absent(wanted)]
 
 
-def _chosen(wanted: Container, found: Surroundings) -> Iterator[tuple[str, bool, str]]:
+def _chosen(wanted: Container, surroundings: Surroundings) -> Iterator[tuple[str, bool, str]]:
     """What is asked for by some containers only."""
     if wanted.network == "none" and not wanted.only_client:
-        own = set(found.devices) <= {"lo"}
+        own = set(surroundings.devices) <= {"lo"}
         yield "container-network", own, "no device but its own loopback"
     if wanted.runtime in _NATIVE_RUNTIMES:  # else another kernel than the host's answers
-        yield "container-seccomp", found.seccomp, "an allow-list around the jail's own"
+        yield "container-seccomp", surroundings.seccomp, "an allow-list around the jail's own"
     for name, most, has in (
-        ("memory", wanted.memory, found.memory),
-        ("pids", wanted.pids, found.pids),
-        ("cpus", wanted.cpus, found.cpus),
+        ("memory", wanted.memory, surroundings.memory),
+        ("pids", wanted.pids, surroundings.pids),
+        ("cpus", wanted.cpus, surroundings.cpus),
     ):
         if most is not None:
             holds = has is not None and has <= most * 1.01
@@ -119,12 +123,16 @@ def _absent(wanted: Container) -> list[dict[str, Any]]:
     return [{"layer": name, "enforced": False, "detail": detail} for name, detail in missing]
 
 
-def _does_not_hold(layer: str, wanted: Container, found: Surroundings) -> SandboxUnavailableError:
-    what = f"the engine started the container, but {layer} does not hold in it"
+def _does_not_hold(
+    layer: str, wanted: Container, surroundings: Surroundings
+) -> SandboxUnavailableError:
+    fault = f"the engine started the container, but {layer} does not hold in it"
     if layer in ("container-memory", "container-pids", "container-cpus"):
         return SandboxUnavailableError(
-            f"{what}: this host's control groups do not permit that limit. Enable them, or use no "
+            f"{fault}: this host's control groups do not permit that limit. Enable them, or use no "
             "limits of the container: DockerSandbox(cgroups=False). Each jail still has its own "
             "limits."
         )
-    return SandboxUnavailableError(f"{what}: {found}, wanted {wanted.user}. Nothing was run.")
+    return SandboxUnavailableError(
+        f"{fault}: {surroundings}, wanted {wanted.user}. Nothing was run."
+    )

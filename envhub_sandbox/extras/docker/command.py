@@ -49,13 +49,13 @@ def build(
         bar.begin(f"reading {ref}")
         snapshot = make.snapshot(ref)
         bar.begin("resolving and building")
-        made = _build(snapshot, base, engine, apt or [], exclude_newer, build_network)
+        image = _build(snapshot, base, engine, apt or [], exclude_newer, build_network)
     if json:
-        print_json(made)
+        print_json(image)
         return
-    out(safe_line(made["image"], 300))
-    say(f"{counted(len(made['packages']), 'package')}, lock sha256:{made['lock']}")
-    say(f"Use it: envhub run {safe_line(ref)} --sandbox docker:{made['image']}")
+    out(safe_line(image["image"], 300))
+    say(f"{counted(len(image['packages']), 'package')}, lock sha256:{image['lock']}")
+    say(f"Use it: envhub run {safe_line(ref)} --sandbox docker:{image['image']}")
 
 
 def _build(
@@ -81,6 +81,11 @@ def _build(
     is_local = snapshot.is_local
     name = Path(snapshot.repo_id).name if is_local else snapshot.repo_id
     engine = find_engine(engine_name)
-    made = packages.derived(engine, base, request, name=name, system=system, network=network)
-    lock = made.lock
-    return {"image": made.tag, "built": made.is_new, "lock": lock.digest, "packages": lock.packages}
+    derived = packages.derived(engine, base, request, name=name, system=system, network=network)
+    lock = derived.lock
+    return {
+        "image": derived.tag,
+        "built": derived.is_new,
+        "lock": lock.digest,
+        "packages": lock.packages,
+    }

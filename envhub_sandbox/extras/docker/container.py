@@ -117,16 +117,16 @@ class RepositoryContainer(Sandbox):
         with server.starting(partial(self._execute, server)) as ready:
             answer, wanted = _answer(ready), server.wanted
             check_started(self.engine, wanted, answer)
-            found = attestation.parse(answer)
+            surroundings = attestation.parse(answer)
             if not Path(server.fd_path).is_socket():
                 raise SandboxUnavailableError(
                     f"{self.engine.kind} started a container whose socket this process cannot use: "
                     "the engine is in a virtual machine, or the runtime has its own kernel. Use "
                     "DockerSandbox(published=True) in Python"
                 )
-            server.layers = attestation.layers(wanted, found, self.title(wanted))
-            server.profile = attestation.profile_for(self.policy.profile, found)
-            server.python = found.python
+            server.layers = attestation.layers(wanted, surroundings, self.title(wanted))
+            server.profile = attestation.profile_for(self.policy.profile, surroundings)
+            server.python = surroundings.python
         return server
 
     def title(self, wanted: Container) -> str:
@@ -210,14 +210,14 @@ def _user(sockets: Path) -> tuple[int, int]:
     """Who the container's processes are, and own the sockets' folder: the caller; for root somebody
     who owns nothing else.
     """
-    found = (-1, -1)
+    owner = (-1, -1)
     if sys.platform != "win32":
-        found = (os.geteuid(), os.getegid())
+        owner = (os.geteuid(), os.getegid())
         if os.geteuid() == 0:
             user = _UNUSED_USERS[secrets.randbelow(len(_UNUSED_USERS))]
-            found = (user, user)
+            owner = (user, user)
             os.chown(sockets, user, user)
-    return found
+    return owner
 
 
 def _answer(ready: int) -> bytes:
@@ -225,8 +225,8 @@ def _answer(ready: int) -> bytes:
     readable = readable_within(ready, STARTUP_S)
     answer = os.read(ready, _ANNOUNCEMENT_BYTES + 1) if readable else b""
     if not answer:
-        what = "ended" if readable else f"did not come up in {STARTUP_S:.0f} s"
-        raise WorkerStartupError(f"the container {what}")
+        ending = "ended" if readable else f"did not come up in {STARTUP_S:.0f} s"
+        raise WorkerStartupError(f"the container {ending}")
     return answer
 
 
@@ -237,18 +237,18 @@ def check_started(engine: Engine, wanted: Container, answer: bytes) -> None:
     """
     if not answer.startswith(b'{"ended"'):
         return
-    said = json.loads(answer)
-    tail = str(said["tail"])
-    if said["ended"] in _ENGINES_CODES:
+    ending = json.loads(answer)
+    tail = str(ending["tail"])
+    if ending["ended"] in _ENGINES_CODES:
         limited = wanted.memory is not None
         raise SandboxUnavailableError(explained(engine.kind, tail, limited=limited))
-    if said["ended"] == _KILLED and wanted.memory is not None:
+    if ending["ended"] == _KILLED and wanted.memory is not None:
         raise WorkerStartupError(
             "the container's program was killed (SIGKILL) while it started, as the kernel does "
             f"when memory runs out: the container has {wanted.memory >> 20} MiB, and the worker's "
             "own server needs a part of that; raise DockerSandbox(memory=...)"
         )
     raise WorkerStartupError(
-        f"the container's program ended at once (exit code {said['ended']}); an image that was "
+        f"the container's program ended at once (exit code {ending['ended']}); an image that was "
         f"built from another version must be built again:\n{tail[-4000:]}"
     )

@@ -93,8 +93,8 @@ def find_engine(name: str | None) -> Engine:
     for candidate in (name,) if name else ENGINES:
         # a failure is not remembered: it may be repaired meanwhile
         try:
-            found = _engine(candidate, os.environ.get("PATH"), os.environ.get("DOCKER_HOST"))
-            return replace(found, passed_over=" ".join(problems))
+            engine = _engine(candidate, os.environ.get("PATH"), os.environ.get("DOCKER_HOST"))
+            return replace(engine, passed_over=" ".join(problems))
         except SandboxUnavailableError as error:
             problems.append(f"{candidate}: {error}")
     raise SandboxUnavailableError("no container engine can be used. " + " ".join(problems))
@@ -153,8 +153,8 @@ def _described(kind: str, command: str) -> Engine:
     )
 
 
-def _count(said: object) -> int:
-    return said if type(said) is int and said > 0 else 0
+def _count(number: object) -> int:
+    return number if type(number) is int and number > 0 else 0
 
 
 def _at(facts: Mapping[str, Any], *path: str) -> Any:
@@ -233,8 +233,8 @@ def explained(engine: str, stderr: str, *, limited: bool = True) -> str:
 
 def _last_line(text: str) -> str:
     lines = [line.strip() for line in text.splitlines() if line.strip()]
-    said = [line for line in lines if not line.startswith(("See '", "Run '"))] or lines
-    return said[-1][:500] if said else ""
+    telling = [line for line in lines if not line.startswith(("See '", "Run '"))] or lines
+    return telling[-1][:500] if telling else ""
 
 
 def own_limits(engine: Engine) -> tuple[str, ...]:
@@ -266,5 +266,5 @@ def find_image(engine: Engine, image: str) -> str:
             raise SandboxUnavailableError(explained(engine.kind, text)) from error
     build = f"{engine.kind} build -t {image} ."
     get = f"{engine.kind} pull {image}" if "/" in image else f"{build} (in a checkout of envhub)"
-    asked = f" It was asked because of {engine.passed_over}" if engine.passed_over else ""
-    raise SandboxUnavailableError(f"{engine.kind} has no image {image!r}; run: {get}.{asked}")
+    reason = f" It was asked because of {engine.passed_over}" if engine.passed_over else ""
+    raise SandboxUnavailableError(f"{engine.kind} has no image {image!r}; run: {get}.{reason}")

@@ -77,23 +77,27 @@ class Found(NamedTuple):
 def find() -> Found:
     """Look everywhere. Removes nothing."""
     containers, unasked = _containers()
-    folders = [Leftover("folder", str(path)) for place in places() for path in stale_folders(place)]
+    folders = [
+        Leftover("folder", str(path))
+        for folder_root in places()
+        for path in stale_folders(folder_root)
+    ]
     return Found([*containers, *folders, *stale_groups(_CGROUPS)], unasked)
 
 
 def _containers() -> tuple[list[Leftover], dict[str, str]]:
     """Those of every engine that answers, and why others do not; a machine need not have any."""
-    found: dict[str, list[Leftover]] = {}
+    by_engine: dict[str, list[Leftover]] = {}
     unasked = {}
     for name in ENGINES:
         try:
             engine = find_engine(name)
-            if engine.kind not in found:
-                found[engine.kind] = list(stale_containers(engine))
+            if engine.kind not in by_engine:
+                by_engine[engine.kind] = list(stale_containers(engine))
         except (SandboxUnavailableError, EngineError) as error:
             if shutil.which(name) and not is_elsewhere(name):
                 unasked[name] = str(error)
-    return [leftover for leftovers in found.values() for leftover in leftovers], unasked
+    return [leftover for leftovers in by_engine.values() for leftover in leftovers], unasked
 
 
 def stale_containers(engine: Engine) -> Iterator[Leftover]:
@@ -106,19 +110,19 @@ def stale_containers(engine: Engine) -> Iterator[Leftover]:
     )
     for container in listed.split():
         with contextlib.suppress(EngineError, ValueError):  # it may have gone meanwhile
-            said = json.loads(engine.run("inspect", container))[0]
-            labels = said["Config"]["Labels"]
-            if _is_mine(labels.get(USER_LABEL)) and _is_deserted_container(said):
-                yield Leftover("container", said["Name"].lstrip("/"), engine)
+            description = json.loads(engine.run("inspect", container))[0]
+            labels = description["Config"]["Labels"]
+            if _is_mine(labels.get(USER_LABEL)) and _is_deserted_container(description):
+                yield Leftover("container", description["Name"].lstrip("/"), engine)
 
 
-def _is_deserted_container(said: dict[str, Any]) -> bool:
-    folder = Path(said["Config"]["Labels"][FOLDER_LABEL])
+def _is_deserted_container(description: dict[str, Any]) -> bool:
+    folder = Path(description["Config"]["Labels"][FOLDER_LABEL])
     try:
         return not is_in_use(folder)
     except FileNotFoundError:
         # an engine may be another machine's: its clients run there, or on a third one
-        return said["State"]["Status"] in _ENDED
+        return description["State"]["Status"] in _ENDED
     except OSError:
         return False
 

@@ -76,10 +76,10 @@ class ImageTarget:
 
     def meets(self, request: PackageRequest) -> bool:
         """Whether the image has all of it; raises as ``image_packages``."""
-        interpreter, there = self._inside()
-        names = set(map(canonicalize_name, there))
-        known = all(guess.is_among(names) for guess in request.guesses)
-        return known and first_unmet(request, there, interpreter.version) is None
+        interpreter, installed = self._inside()
+        names = set(map(canonicalize_name, installed))
+        brings_all = all(guess.is_among(names) for guess in request.guesses)
+        return brings_all and first_unmet(request, installed, interpreter.version) is None
 
     def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
         """An environment of this machine, to be mounted; its interpreter is the image's.
@@ -87,8 +87,8 @@ class ImageTarget:
         ``SandboxUnavailableError``: it is no image of ours.
         """
         ours = interpreter_fitting(self._inside()[0], request)
-        made = HERE.make(replace(request, python=ours.path), tell)
-        return replace(made, python="")
+        packages = HERE.make(replace(request, python=ours.path), tell)
+        return replace(packages, python="")
 
 
 @lru_cache(maxsize=16)
@@ -120,9 +120,11 @@ def interpreter_fitting(theirs: Interpreter, request: PackageRequest) -> Interpr
     """An interpreter of this machine whose packages the image's can import.
     Raises ``DependencyError``: there is none.
     """
-    asked = SpecifierSet(request.supports)
-    if not theirs.fits(asked) or (request.python and not _is_asked(theirs, request.python)):
-        wanted = request.python or str(asked)
+    versions_asked = SpecifierSet(request.supports)
+    if not theirs.fits(versions_asked) or (
+        request.python and not _is_asked(theirs, request.python)
+    ):
+        wanted = request.python or str(versions_asked)
         raise DependencyError(
             f"it needs Python {wanted}, and the image has {theirs.version}: build envhub-worker "
             "from another base (docs/deployment.md)",
@@ -149,8 +151,8 @@ def interpreter_fitting(theirs: Interpreter, request: PackageRequest) -> Interpr
     return ours
 
 
-def _is_asked(theirs: Interpreter, asked: str) -> bool:
-    return "/" not in asked and theirs.fits(versions(asked))
+def _is_asked(theirs: Interpreter, text: str) -> bool:
+    return "/" not in text and theirs.fits(versions(text))
 
 
 def _remedy() -> str:
@@ -182,8 +184,8 @@ USER 65532:65532
 
 def target_of(engine: Engine, image: str) -> Target:
     """What runs in a worker's image; raises as ``image_packages``."""
-    found, _ = image_packages(engine, image)
-    return Target(version=".".join(found.version.split(".")[:2]), machine=found.machine)
+    interpreter, _ = image_packages(engine, image)
+    return Target(version=".".join(interpreter.version.split(".")[:2]), machine=interpreter.machine)
 
 
 def tag_for(repository: str, base: str, lock: Lock, system: Sequence[str]) -> str:
@@ -256,8 +258,8 @@ def derived(
 
 
 def _check_python(request: PackageRequest, target: Target) -> None:
-    asked = versions(request.python) & SpecifierSet(request.supports)
-    if os.sep in request.python or not asked.contains(f"{target.version}.99"):
+    versions_asked = versions(request.python) & SpecifierSet(request.supports)
+    if os.sep in request.python or not versions_asked.contains(f"{target.version}.99"):
         raise DependencyError(
             f"{request.source} asks for Python {request.python or request.supports}, and the image "
             f"has {target.version}: build envhub-worker from another base (docs/deployment.md)",
@@ -275,10 +277,10 @@ class BuiltImageTarget(ImageTarget):
     def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
         """An image, whose name stands for its packages; raises as ``derived``."""
         engine = self._engine()
-        made = derived(engine, self._image, request, network=self._network, tell=tell)
-        facts = {"lock": f"sha256:{made.lock.digest}", "packages": made.lock.packages}
-        inferred = [guess.facts for guess in request.guesses if guess.module in made.taken]
-        return PackageSet(made.tag, facts | ({"inferred": inferred} if inferred else {}))
+        packages = derived(engine, self._image, request, network=self._network, tell=tell)
+        facts = {"lock": f"sha256:{packages.lock.digest}", "packages": packages.lock.packages}
+        inferred = [guess.facts for guess in request.guesses if guess.module in packages.taken]
+        return PackageSet(packages.tag, facts | ({"inferred": inferred} if inferred else {}))
 
 
 def build(engine: Engine, recipe: str, lock: Lock, tag: str, network: str | None) -> None:
@@ -292,8 +294,8 @@ def build(engine: Engine, recipe: str, lock: Lock, tag: str, network: str | None
             [*command, folder], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment()
         )
     if done.returncode != 0:
-        said = done.stdout.decode(errors="replace")[-4000:]
-        raise DependencyError(f"{engine.kind} could not build {tag}:\n{said}")
+        output = done.stdout.decode(errors="replace")[-4000:]
+        raise DependencyError(f"{engine.kind} could not build {tag}:\n{output}")
 
 
 def exists(engine: Engine, tag: str) -> bool:

@@ -77,9 +77,9 @@ class PublishedContainer(RepositoryContainer):
             )
             answer = container.start(wanted, STARTUP_S)
             check_started(self.engine, wanted, answer)
-            found = attestation.parse(answer)
-            layers = attestation.layers(wanted, found, self.title(wanted))
-            profile = attestation.profile_for(self.policy.profile, found)
+            surroundings = attestation.parse(answer)
+            layers = attestation.layers(wanted, surroundings, self.title(wanted))
+            profile = attestation.profile_for(self.policy.profile, surroundings)
             far = TcpServer(_server_key(answer), secret)
             return PublishedServer(container, far, layers, profile)
         except BaseException:
@@ -180,14 +180,14 @@ class EngineRun:
     def endpoint(self) -> str:
         """Where its port is published. Raises ``SandboxUnavailableError``: it is not."""
         try:
-            said = self._engine.run("port", self._name, f"{PORT}/tcp").split()
+            published = self._engine.run("port", self._name, f"{PORT}/tcp").split()
         except EngineError as error:
-            said = [str(error)]
-        address, _, port = (said or ["nothing"])[0].rpartition(":")
+            published = [str(error)]
+        address, _, port = (published or ["nothing"])[0].rpartition(":")
         if address != "127.0.0.1" or not port.isdigit():
             raise SandboxUnavailableError(
                 f"{self._engine.kind} does not publish the container's port on loopback: it says "
-                f"{' '.join(said)[:200]!r}"
+                f"{' '.join(published)[:200]!r}"
             )
         return f"tcp://127.0.0.1:{port}"
 

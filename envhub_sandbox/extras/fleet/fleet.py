@@ -78,19 +78,21 @@ class Fleet(Sandbox):
         ``resolve``: makes a sandbox of a name that is no address.
         """
 
-        def sandbox_of(place: str | Sandbox) -> Sandbox:
-            if is_fleet(place):
+        def sandbox_of(sandbox: str | Sandbox) -> Sandbox:
+            if is_fleet(sandbox):
                 raise PolicyError("a fleet's places are named one by one: no fleet is one")
-            if isinstance(place, str) and place.startswith("tcp://"):
-                return RemoteSandbox(place, **self.remote)
-            return resolve(place)
+            if isinstance(sandbox, str) and sandbox.startswith("tcp://"):
+                return RemoteSandbox(sandbox, **self.remote)
+            return resolve(sandbox)
 
         return OpenFleet(places_of(self.places), sandbox_of)
 
 
-def is_fleet(place: object) -> bool:
+def is_fleet(sandbox: object) -> bool:
     """Whether this names several places."""
-    return isinstance(place, (list, tuple, Fleet)) or (isinstance(place, str) and is_list(place))
+    return isinstance(sandbox, (list, tuple, Fleet)) or (
+        isinstance(sandbox, str) and is_list(sandbox)
+    )
 
 
 class OpenFleet(Sandbox):

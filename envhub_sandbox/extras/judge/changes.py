@@ -180,9 +180,9 @@ def _named(what: str, then: Mapping[str, str], now: Mapping[str, str]) -> Iterat
 def _findings(then: Static, now: Static, other: Collection[str]) -> Iterator[Change]:
     before, after = _by_line(then, other), _by_line(now, other)
     for how, mine, others in (("new", after, before), ("gone", before, after)):
-        known = Counter({key: len(found) for key, found in others.items()})
+        counts = Counter({key: len(found) for key, found in others.items()})
         for key, found in mine.items():
-            for finding in found[known[key] :]:
+            for finding in found[counts[key] :]:
                 yield Change("finding", how, finding.text, finding)
 
 
@@ -192,7 +192,7 @@ def _by_line(read: Static, other: Collection[str]) -> dict[tuple[str, ...], list
     findings have the names of files as far as they are printed.
     """
     lines: dict[str, list[str]] = {}
-    found: dict[tuple[str, ...], list[Finding]] = {}
+    findings: dict[tuple[str, ...], list[Finding]] = {}
     records = _records(read)
     digests: dict[str, list[str]] = {}
     for path in other:
@@ -205,8 +205,8 @@ def _by_line(read: Static, other: Collection[str]) -> dict[tuple[str, ...], list
                 split = re.split("\r\n|\r|\n", data.decode("utf-8", "replace"))
                 lines[finding.file] = [line.strip() for line in split]
             text = lines[finding.file][finding.line - 1 : finding.line]
-        found.setdefault((finding.id, finding.file, finding.message, *text), []).append(finding)
-    return found
+        findings.setdefault((finding.id, finding.file, finding.message, *text), []).append(finding)
+    return findings
 
 
 def environments(then: Sequence[TaskFingerprint], now: Sequence[TaskFingerprint]) -> list[Change]:

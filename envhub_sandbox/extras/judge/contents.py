@@ -117,12 +117,12 @@ def hidden(name: str, text: str, *, is_code: bool) -> Iterator[Finding]:
     """Characters that are shown as nothing, as another order, or as other letters."""
     pattern = _HIDDEN_IN_CODE if is_code else _HIDDEN
     line, counted, seen = 1, 0, set()
-    for found in pattern.finditer(text):
-        line += text.count("\n", counted, found.start())
-        counted = found.start()
-        if (line, found[0]) not in seen:
-            seen.add((line, found[0]))
-            yield Finding("source-hidden", _called(found[0]), file=name, line=line)
+    for match in pattern.finditer(text):
+        line += text.count("\n", counted, match.start())
+        counted = match.start()
+        if (line, match[0]) not in seen:
+            seen.add((line, match[0]))
+            yield Finding("source-hidden", _called(match[0]), file=name, line=line)
         if len(seen) >= _MOST_HIDDEN:
             return
 
@@ -215,16 +215,16 @@ _LONG_LINE = re.compile(r"^[^\n]{2000,}", re.MULTILINE)
 
 def constructs(file: str, parsed: ParsedFile) -> Iterator[Finding]:
     """What a file has of them, each once in a line."""
-    found = (*_imported(parsed), *_used(parsed), *_said(parsed))
-    for line, check, message in sorted(set(found)):
+    rows = (*_imported(parsed), *_used(parsed), *_said(parsed))
+    for line, check, message in sorted(set(rows)):
         yield Finding(check, message, file=file, line=line)
 
 
 def long_lines(file: str, text: str) -> Iterator[Finding]:
     """Lines that are too long to be read to their end: what stands there need not be seen."""
-    for found in _LONG_LINE.finditer(text):
-        line = 1 + text.count("\n", 0, found.start())
-        message = f"a line of {len(found[0])} characters"
+    for match in _LONG_LINE.finditer(text):
+        line = 1 + text.count("\n", 0, match.start())
+        message = f"a line of {len(match[0])} characters"
         yield Finding(_OBSCURE, message, file=file, line=line)
 
 

@@ -121,9 +121,9 @@ class Report:
     folder: str = ""
     _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
-    def judged(self, check: str, found: Iterable[str], task: str = "") -> None:
+    def judged(self, check: str, texts: Iterable[str], task: str = "") -> None:
         """A check was made: it found this, or nothing. Trust: texts from the worker."""
-        messages = list(found)
+        messages = list(texts)
         for message in messages:
             self.add(Finding(check, message, task))
         if not messages:
@@ -154,8 +154,8 @@ class Report:
 
     def failures(self, fail_on: Severity, allowed: Collection[str] = ()) -> list[Finding]:
         """The findings that weigh enough, without those that are allowed."""
-        found = (finding for finding in self.findings if finding.id not in allowed)
-        return [finding for finding in found if finding.check.severity.reaches(fail_on)]
+        findings = (finding for finding in self.findings if finding.id not in allowed)
+        return [finding for finding in findings if finding.check.severity.reaches(fail_on)]
 
     def stopped(self, seconds: float, at: str) -> None:
         """A deadline of so many seconds ended it at something: what was not judged is a finding."""
@@ -175,9 +175,9 @@ class Report:
     def verdict(self, failures: Collection[Finding]) -> str:
         """What came of it, in a sentence."""
         held = counted(len({check for check, _ in self.passed}), "check holds", "checks hold")
-        found = counted(len(self.findings) + self.left_out, "finding")
+        findings = counted(len(self.findings) + self.left_out, "finding")
         if not failures:
-            return f"{held}, {found}: passed"
+            return f"{held}, {findings}: passed"
         if self.is_unjudged(failures):
-            return f"{held}, {found}; not judged to its end"
-        return f"{held}, {found}, of which {counted(len(failures), 'fails', 'fail')} it"
+            return f"{held}, {findings}; not judged to its end"
+        return f"{held}, {findings}, of which {counted(len(failures), 'fails', 'fail')} it"

@@ -136,10 +136,10 @@ class _Judge:
         reference = self._asked.reference
         moving = f"{reference} can mean another commit or version tomorrow"
         self._report.judged("pinned", [moving] if is_moving(reference, self._snapshot) else [])
-        found = survey(self._snapshot, self._files).findings
-        for finding in found:
+        findings = survey(self._snapshot, self._files).findings
+        for finding in findings:
             self._report.add(finding)
-        wrong = {finding.id for finding in found}
+        wrong = {finding.id for finding in findings}
         for check in CHECKS:
             if check.startswith(("licence", "card", "source-")) and check not in wrong:
                 self._report.judged(check, [])
@@ -153,10 +153,10 @@ class _Judge:
             stated = () if says is None else says.wanted
             wanted = {package.requirement.name: package.requirement for package in stated}
             if self._asked.arguments.get("python") is None and self._is_here:
-                made = packages_for(self._snapshot, choice)
-                if made is not None:
-                    packages = Path(made.packages)
-                    inferred = made.facts.get("inferred", ())
+                packages_made = packages_for(self._snapshot, choice)
+                if packages_made is not None:
+                    packages = Path(packages_made.packages)
+                    inferred = packages_made.facts.get("inferred", ())
                     taken = {guess["module"]: guess["where"] for guess in inferred}
         except DependencyError as error:
             if error.reason not in ("requirement", "resolution", "integrity"):
@@ -165,10 +165,10 @@ class _Judge:
             raise _StoppedError from error
         self._report.judged("requirements", [])
         read = parsing.imports(self._snapshot, self._files)
-        found = undeclared(read, wanted, packages, taken)
-        for finding in found:
+        missing = undeclared(read, wanted, packages, taken)
+        for finding in missing:
             self._report.add(finding)
-        if not found:
+        if not missing:
             self._report.judged("imports", [])
 
     def make(self, *, record_denials: bool = False, **changes: Any) -> EnvSuites:
@@ -249,8 +249,8 @@ class _Judge:
     def _denied(self, denied: Iterable[str] | None, task: str = "") -> None:
         """What a jail was refused, where that was recorded."""
         if denied is not None:
-            for check, found in denial_findings(denied).items():
-                self._report.judged(check, found, task)
+            for check, findings in denial_findings(denied).items():
+                self._report.judged(check, findings, task)
 
     def _made_to_record(self) -> EnvSuites:
         """Of which what they are denied is recorded, where a kernel and its containers let it be.

@@ -50,20 +50,20 @@ def read_entries(file: IO[bytes], title: str) -> list[ListEntry]:
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise HubReferenceError(f"{title}:{line}: this is not UTF-8") from None
-    found: dict[str, ListEntry] = {}
-    wrong = list(_read_into(found, text))
+    entries: dict[str, ListEntry] = {}
+    wrong = list(_read_into(entries, text))
     if wrong:
         more = [f"and {len(wrong) - _SHOWN} more"] if len(wrong) > _SHOWN else []
         lines = "\n".join([*(f"{title}:{line}: {what}" for line, what in wrong[:_SHOWN]), *more])
         raise HubReferenceError(f"nothing was run, because the list cannot be read:\n{lines}")
-    if not found:
+    if not entries:
         raise HubReferenceError(f"{title} has no reference; write one on each line")
-    if len(found) > MOST:
+    if len(entries) > MOST:
         raise HubReferenceError(f"{title} has more than {MOST} references; divide it")
-    return list(found.values())
+    return list(entries.values())
 
 
-def _read_into(found: dict[str, ListEntry], text: str) -> Iterator[tuple[int, str]]:
+def _read_into(entries: dict[str, ListEntry], text: str) -> Iterator[tuple[int, str]]:
     """Take every line; yield where something is wrong, and what."""
     for number, line in enumerate(re.split("\r\n|\r|\n", text), 1):
         written = line.strip()
@@ -75,7 +75,7 @@ def _read_into(found: dict[str, ListEntry], text: str) -> Iterator[tuple[int, st
             hint = "; put a comment on its own line" if " #" in written else ""
             yield number, printable(f"{error}{hint}", _LONGEST)
             continue
-        first = found.setdefault(meaning, ListEntry(reference, meaning, number))
+        first = entries.setdefault(meaning, ListEntry(reference, meaning, number))
         if first.line != number:
             yield number, f"{reference} is already in line {first.line}, as {first.reference}"
 

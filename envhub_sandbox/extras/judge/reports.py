@@ -67,7 +67,7 @@ def suite(report: Report, failures: Sequence[Finding]) -> ElementTree.Element:
         *((check, "") for check in report.unmade),
         *(("*", task) for task in report.waiting),
     ]
-    made = ElementTree.Element(
+    root = ElementTree.Element(
         "testsuite",
         name=xml_text(report.reference),
         tests=str(len(asked) + len(unjudged)),
@@ -76,19 +76,19 @@ def suite(report: Report, failures: Sequence[Finding]) -> ElementTree.Element:
         skipped=str(len(unjudged)),
     )
     for check, task in asked:
-        case = _case(made, check, task)
-        found = [
+        case = _case(root, check, task)
+        findings = [
             finding for finding in report.findings if (finding.id, finding.task) == (check, task)
         ]
-        text = "\n".join(finding.text for finding in found)
+        text = "\n".join(finding.text for finding in findings)
         if (check, task) in failed:
             words = xml_text(CHECKS[check].sentence)
             ElementTree.SubElement(case, "failure", message=words).text = xml_text(text)
-        elif found:
+        elif findings:
             ElementTree.SubElement(case, "system-out").text = xml_text(text)
     for check, task in unjudged:
-        ElementTree.SubElement(_case(made, check, task), "skipped", message="not judged")
-    return made
+        ElementTree.SubElement(_case(root, check, task), "skipped", message="not judged")
+    return root
 
 
 def _case(suite: ElementTree.Element, check: str, task: str) -> ElementTree.Element:
@@ -122,17 +122,17 @@ def sarif(report: Report, failures: Sequence[Finding]) -> str:
 
 
 def _result(finding: Finding, failures: Sequence[Finding], folder: str) -> dict[str, Any]:
-    where = f"{finding.task}: " if finding.task else ""
-    place: dict[str, Any] = {
+    prefix = f"{finding.task}: " if finding.task else ""
+    location: dict[str, Any] = {
         "artifactLocation": {"uri": quote(folder + (finding.file or "env.py"))}
     }
     if finding.line:
-        place["region"] = {"startLine": finding.line}
+        location["region"] = {"startLine": finding.line}
     return {
         "ruleId": finding.id,
         "level": finding.check.severity.value,
-        "message": {"text": _sarif_text(f"{where}{finding.message}")},
-        "locations": [{"physicalLocation": place}],
+        "message": {"text": _sarif_text(f"{prefix}{finding.message}")},
+        "locations": [{"physicalLocation": location}],
         "properties": {"fails": finding in failures},
     }
 
@@ -146,11 +146,11 @@ def _sarif_text(text: str) -> str:
 def workflow_commands(report: Report) -> Iterator[str]:
     """GitHub's workflow commands, one a line: a stranger's text cannot begin another."""
     for finding in report.findings:
-        place = f"file={_property(report.folder + finding.file)}," if finding.file else ""
-        place += f"line={finding.line}," if finding.line else ""
+        location = f"file={_property(report.folder + finding.file)}," if finding.file else ""
+        location += f"line={finding.line}," if finding.line else ""
         title = f"envhub check: {finding.id}" + (f" ({finding.task})" if finding.task else "")
         text = f"{finding.message}\n{finding.cure}"
-        yield workflow_command(_GITHUB[finding.check.severity], title, text, place)
+        yield workflow_command(_GITHUB[finding.check.severity], title, text, location)
     if report.confinement is not None and report.confinement.is_partial:
         words = "\n".join(report.confinement.lines())
         yield workflow_command("notice", "envhub check: confinement", words)

@@ -85,8 +85,8 @@ def read_settings(path: Path, known: Collection[str]) -> dict[str, Any]:
         raise PolicyError(
             f"check in {path} is not a table; write [check] and below it a line for each option"
         )
-    asked = {name.replace("-", "_"): value for name, value in table.items()}
-    unknown = sorted(set(asked) - set(known))
+    options = {name.replace("-", "_"): value for name, value in table.items()}
+    unknown = sorted(set(options) - set(known))
     if unknown:
         names = [name.replace("_", "-") for name in sorted(known)]
         near = nearest(unknown[0].replace("_", "-"), names)
@@ -94,7 +94,7 @@ def read_settings(path: Path, known: Collection[str]) -> dict[str, Any]:
             f"[check] in {path} has no option {', '.join(unknown)}{near}; there are "
             f"{', '.join(names)}"
         )
-    return asked
+    return options
 
 
 def is_judged(path: Path, reference: str) -> bool:
@@ -130,9 +130,9 @@ def folder_below_here(reference: str) -> str:
 
 def _named_in(path: Path, folder: str) -> Path | None:
     """Where a path below a folder leads, if none of the links in there is followed."""
-    whole = Path(os.path.abspath(path))
-    tops = [parent for parent in whole.parents if os.path.realpath(parent) == folder]
-    return Path(folder, whole.relative_to(tops[-1])) if tops else None
+    absolute = Path(os.path.abspath(path))
+    tops = [parent for parent in absolute.parents if os.path.realpath(parent) == folder]
+    return Path(folder, absolute.relative_to(tops[-1])) if tops else None
 
 
 def _named_in_checkout(path: Path, reference: str) -> Path | None:

@@ -72,36 +72,36 @@ class Survey:
 
 def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Survey:
     """Look at every file of a repository, and at what ``parsing.read`` read of it."""
-    found = Survey()
+    surveyed = Survey()
     if snapshot.repo_type != "pypi":  # whose one file is ours
-        found.add(_papers(snapshot))
-    found.add(_in_place(snapshot))
-    found.add(_in_front(snapshot))
+        surveyed.add(_papers(snapshot))
+    surveyed.add(_in_place(snapshot))
+    surveyed.add(_in_front(snapshot))
     left, unread = _MOST_BYTES_IN_ALL, 0
     for record in sorted(snapshot.files, key=attrgetter("path")):
         path = snapshot.root / record.path
         ending = bytes_of(path, contents.ENDING, max(record.size - contents.ENDING, 0))
         kind = contents.kind_of_contents(record.path, bytes_of(path, contents.BEGINNING), ending)
-        found.files.append(File(record, kind))
-        found.add(contents.of_kind(record.path, kind, is_folder=snapshot.is_local))
+        surveyed.files.append(File(record, kind))
+        surveyed.add(contents.of_kind(record.path, kind, is_folder=snapshot.is_local))
         for finding in contents.hidden(record.path, record.path, is_code=True):
-            found.add([Finding(finding.id, f"its name {finding.message}", file=record.path)])
+            surveyed.add([Finding(finding.id, f"its name {finding.message}", file=record.path)])
         if record.path in parsed:
-            found.add(_in_code(record, parsed[record.path]))
+            surveyed.add(_in_code(record, parsed[record.path]))
         if parsed.get(record.path) is not None:
-            found.add(_in_text(record, path, is_code=True))
+            surveyed.add(_in_text(record, path, is_code=True))
         elif kind in ("Python", "text") and record.size <= min(left, _MOST_BYTES_OF_TEXT):
             left -= record.size
-            found.add(_in_text(record, path, is_code=kind == "Python"))
+            surveyed.add(_in_text(record, path, is_code=kind == "Python"))
         else:
             unread += kind == "text"
     if unread:
         texts = counted(unread, "text is", "texts are")
         message = f"{texts} more than is read: 1 MiB of a file, and 32 MiB in all"
-        found.findings.append(Finding("source-unread", message))
-    if len(found.findings) >= _MOST:
-        found.findings.append(Finding("source-unread", "there is more to find than is kept"))
-    return found
+        surveyed.findings.append(Finding("source-unread", message))
+    if len(surveyed.findings) >= _MOST:
+        surveyed.findings.append(Finding("source-unread", "there is more to find than is kept"))
+    return surveyed
 
 
 def bytes_of(path: Path, most: int, start: int = 0) -> bytes:

@@ -41,17 +41,17 @@ class Bounds:
         """Those of this machine's user; ``DependencyError`` if a variable holds no number."""
         return cls(_number(BYTES_VARIABLE, MAX_BYTES), _number(FILES_VARIABLE, MAX_FILES))
 
-    def check(self, size: int, files: int, what: str) -> None:
+    def check(self, size: int, files: int, subject: str) -> None:
         """Refuse more with ``DependencyError``."""
         if size > self.bytes:
             raise DependencyError(
-                f"{what} {size_text(size)}; at most {size_text(self.bytes)} are installed. No "
+                f"{subject} {size_text(size)}; at most {size_text(self.bytes)} are installed. No "
                 f"environment was made. If you accept the size, set {BYTES_VARIABLE} to more bytes",
                 reason="size",
             )
         if files > self.files:
             raise DependencyError(
-                f"{what} {files} files; at most {self.files} are installed. No environment was "
+                f"{subject} {files} files; at most {self.files} are installed. No environment was "
                 f"made. If you accept the size, set {FILES_VARIABLE} to more",
                 reason="size",
             )

@@ -150,26 +150,26 @@ def optional(root: Path) -> dict[str, WantedPackage]:
     try:
         extras = table(pyproject(root), "project", "optional-dependencies")
         where = f"[project.optional-dependencies] of {PROJECT}"
-        found = [wanted for row in extras.values() for wanted in _list(row, where)]
+        packages = [wanted for row in extras.values() for wanted in _list(row, where)]
     except DependencyError:
         return {}
-    return {canonicalize_name(package.requirement.name): package for package in found}
+    return {canonicalize_name(package.requirement.name): package for package in packages}
 
 
 def not_read(root: Path, entry: str) -> list[str]:
     """What says there which packages are needed, in a form that is not read."""
     beside = (root / entry).parent
-    found = [name for name in _NOT_READ if (beside / name).is_file() or (root / name).is_file()]
+    names = [name for name in _NOT_READ if (beside / name).is_file() or (root / name).is_file()]
     try:
         data = pyproject(root)
     except DependencyError:
-        return found
+        return names
     if "poetry" in table(data, "tool"):
-        found.append(f"[tool.poetry] of {PROJECT}")
+        names.append(f"[tool.poetry] of {PROJECT}")
     dynamic = table(data, "project").get("dynamic")
     if isinstance(dynamic, list) and "dependencies" in dynamic:
-        found.append(f"dynamic dependencies of {PROJECT}")
-    return found
+        names.append(f"dynamic dependencies of {PROJECT}")
+    return names
 
 
 def _unsupported(text: str) -> DependencyError:
@@ -181,10 +181,10 @@ def parse_requirement(text: str, where: str) -> WantedPackage:
     plain, *hashes = map(str.strip, re.split(r"(?<=\s)(?=--hash[= ])", text))
     if len(plain) > MAX_LINE:
         raise _unsupported(f"{where} has {len(plain)} characters; at most {MAX_LINE} are read")
-    found = [_HASH.fullmatch(digest.strip()) for digest in hashes]
+    matches = [_HASH.fullmatch(digest.strip()) for digest in hashes]
     try:
         requirement = Requirement(plain)
-        if not all(found):
+        if not all(matches):
             raise InvalidRequirement("a hash that is none")
         if not _is_literal(plain):
             raise InvalidRequirement("a text that would be printed as something else")
@@ -199,7 +199,7 @@ def parse_requirement(text: str, where: str) -> WantedPackage:
             f"{where} takes {requirement.name} from {requirement.url[:200]!r}; only packages of "
             f"the index are installed. {_advice()}"
         )
-    return WantedPackage(requirement, where, tuple(match[1] for match in found if match))
+    return WantedPackage(requirement, where, tuple(match[1] for match in matches if match))
 
 
 def _is_literal(text: str) -> bool:

@@ -101,10 +101,10 @@ def key_of(lock: Lock, interpreter: Interpreter) -> str:
 
 def ready(key: str) -> Environment | None:
     """The environment of this name, if it has been made. Raises ``DependencyError``."""
-    found = _read(root() / key)
-    if found is not None:
-        _refuse_shared(found.home)
-    return found
+    environment = _read(root() / key)
+    if environment is not None:
+        _refuse_shared(environment.home)
+    return environment
 
 
 def provide(lock: Lock, interpreter: Interpreter, tell: Tell = lambda line: None) -> Environment:
@@ -114,15 +114,15 @@ def provide(lock: Lock, interpreter: Interpreter, tell: Tell = lambda line: None
     Raises ``DependencyError``.
     """
     key = key_of(lock, interpreter)
-    made = ready(key)
-    if made is None:
+    environment = ready(key)
+    if environment is None:
         held = root() / f"{key}.lock"
         waiting = "waiting for another process, which makes the same environment"
         try:
             folders.make(root())
             _refuse_shared(root())
             with locks.held(held, wait_s=_WAIT_S, on_wait=lambda: tell(waiting)) as descriptor:
-                made = ready(key) or _made(key, lock, interpreter, descriptor, tell)
+                environment = ready(key) or _made(key, lock, interpreter, descriptor, tell)
         except TimeoutError as error:
             raise DependencyError(
                 f"another process has been making the same environment for {_WAIT_S / 3600:.0f} "
@@ -136,15 +136,15 @@ def provide(lock: Lock, interpreter: Interpreter, tell: Tell = lambda line: None
                 f"{CACHE_VARIABLE} to another folder"
             ) from error
     with contextlib.suppress(OSError):
-        os.utime(made.home / RECORD)
-    return made
+        os.utime(environment.home / RECORD)
+    return environment
 
 
 def every() -> list[Environment]:
     """All of them, the latest used first."""
-    found = [_read(record.parent) for record in root().glob(f"[!.]*/{RECORD}")]
+    environments = [_read(record.parent) for record in root().glob(f"[!.]*/{RECORD}")]
     return sorted(
-        (environment for environment in found if environment is not None),
+        (environment for environment in environments if environment is not None),
         key=attrgetter("used"),
         reverse=True,
     )
@@ -227,9 +227,9 @@ def _made(key: str, lock: Lock, interpreter: Interpreter, held: int, tell: Tell)
             "size": size,
         }
         _publish(building, key, facts)
-    made = _read(root() / key)
-    assert made is not None
-    return made
+    environment = _read(root() / key)
+    assert environment is not None
+    return environment
 
 
 def _publish(building: Path, key: str, facts: dict[str, object]) -> None:

@@ -85,27 +85,27 @@ def release(version: str) -> str:
     return version.rstrip("+")
 
 
-def find(asked: str, declared: str = "", *, fetch: bool = False) -> Interpreter:
+def find(python: str, declared: str = "", *, fetch: bool = False) -> Interpreter:
     """An interpreter that fits: this one if it does, else the newest that is at hand.
 
     The caller may ask for a version (``"3.11"``), versions (``">=3.11,<3.13"``) or a path; the
     repository declares versions. Where none is at hand uv may ``fetch`` one.
     """
-    if os.sep in asked:
-        return _at(os.path.abspath(os.path.expanduser(asked)))
-    wanted = versions(asked) & SpecifierSet(declared) & _OLDEST
+    if os.sep in python:
+        return _at(os.path.abspath(os.path.expanduser(python)))
+    wanted = versions(python) & SpecifierSet(declared) & _OLDEST
     ours = own()
     if ours.fits(wanted):
         return ours
-    found = _others(wanted)
-    if not found and fetch:
+    interpreters = _others(wanted)
+    if not interpreters and fetch:
         _fetch(wanted)
-        found = _others(wanted)
-    if found:
-        return found[0]
-    why = f"you ask for Python {asked!r}" if asked else f"it runs in Python {declared}"
+        interpreters = _others(wanted)
+    if interpreters:
+        return interpreters[0]
+    why = f"you ask for Python {python!r}" if python else f"it runs in Python {declared}"
     named = option_name("dependencies", {"python": "/path/to/python3"})
-    fetched = option_name("dependencies", {"python": asked or "3.12", "fetch_python": True})
+    fetched = option_name("dependencies", {"python": python or "3.12", "fetch_python": True})
     raise DependencyError(
         f"{why}, and this machine has no such interpreter of 3.10 or later; this one is "
         f"{ours.version} ({ours.path}). Install one ('uv python install'), let uv download it with "
@@ -116,8 +116,8 @@ def find(asked: str, declared: str = "", *, fetch: bool = False) -> Interpreter:
 
 def others(declared: str, first: Interpreter) -> list[Interpreter]:
     """The other releases on this machine that a repository may run in, the newest first."""
-    found = _others(SpecifierSet(declared) & _OLDEST)
-    return [version for version in found if version.series != first.series]
+    interpreters = _others(SpecifierSet(declared) & _OLDEST)
+    return [version for version in interpreters if version.series != first.series]
 
 
 def _fetch(wanted: SpecifierSet) -> None:
@@ -195,15 +195,15 @@ def first_unmet(
     packages (``there``) and version are given.
     """
     python = SpecifierSet(request.supports)
-    found = version or release(platform.python_version())
-    if not python.contains(found, prereleases=True):
+    python_version = version or release(platform.python_version())
+    if not python.contains(python_version, prereleases=True):
         return f"python{request.supports}"
     hashed = next(
         (package for package in request.wanted if package.hashes or package.requirement.url), None
     )
     if hashed is not None:
         return str(hashed.requirement)
-    reached = _reached((package.requirement for package in request.wanted), there, found)
+    reached = _reached((package.requirement for package in request.wanted), there, python_version)
     for wanted, met_by in reached:
         if met_by is None or not _is_among(met_by, wanted.specifier):
             return str(wanted)

@@ -103,17 +103,17 @@ def _guessed(root: Path, rows: tuple[tuple[str, str, int], ...]) -> tuple[Guess,
     from envhub_sandbox.extras.packages.declared import optional, parse_requirement
 
     extras = optional(root)
-    found: dict[str, Guess] = {}
+    guesses: dict[str, Guess] = {}
     for name, file, line in rows:
-        known = _of_id(name) if "-" in name else _of_module(name, extras)
-        if known is not None and len(found) < _MOST:
-            module, requirement, brought_by = known
+        guess = _of_id(name) if "-" in name else _of_module(name, extras)
+        if guess is not None and len(guesses) < _MOST:
+            module, requirement, brought_by = guess
             wanted = parse_requirement(
                 requirement,
                 f"{printable(file, 200)}, line {line}, which needs {module}" if line else file,
             )
-            found.setdefault(requirement, Guess(module, wanted, tuple(brought_by)))
-    return tuple(found.values())
+            guesses.setdefault(requirement, Guess(module, wanted, tuple(brought_by)))
+    return tuple(guesses.values())
 
 
 def _of_id(text: str) -> tuple[str, str, list[str]] | None:
@@ -221,12 +221,12 @@ def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     from envhub_sandbox.extras.sources import parsing
 
     files = parsing.read(snapshot)
-    found = [
+    rows_found = [
         (statement.module, statement.file, statement.line)
         for statement in parsing.imports(snapshot, files)
     ]
-    found = [row for row in found if row[0].partition(".")[0] not in _WORKERS]
-    rows = [*found, *(row for row in parsing.ids(snapshot, files) if _of_id(row[0]))]
+    rows_found = [row for row in rows_found if row[0].partition(".")[0] not in _WORKERS]
+    rows = [*rows_found, *(row for row in parsing.ids(snapshot, files) if _of_id(row[0]))]
     keep(*place, json.dumps(rows))
     return tuple(rows)
 

@@ -89,12 +89,18 @@ class ThisMachine:
         from envhub_sandbox.extras.packages import environments
         from envhub_sandbox.extras.packages.resolution import resolutions
 
-        found = resolutions.resolution_for(request, tell, upgrade=self.upgrade)
-        if found.lock.has_cuda and not request.gpu:
-            _warn_of_cuda(found.lock, found.interpreter)
-        made = PackageSet.of(environments.provide(found.lock, found.interpreter, tell))
-        inferred = [guess.facts for guess in request.guesses if guess.module in found.taken]
-        return replace(made, facts=made.facts | {"inferred": inferred}) if inferred else made
+        resolution = resolutions.resolution_for(request, tell, upgrade=self.upgrade)
+        if resolution.lock.has_cuda and not request.gpu:
+            _warn_of_cuda(resolution.lock, resolution.interpreter)
+        packages = PackageSet.of(
+            environments.provide(resolution.lock, resolution.interpreter, tell)
+        )
+        inferred = [guess.facts for guess in request.guesses if guess.module in resolution.taken]
+        return (
+            replace(packages, facts=packages.facts | {"inferred": inferred})
+            if inferred
+            else packages
+        )
 
 
 def _warn_of_cuda(lock: Lock, interpreter: Interpreter) -> None:
@@ -106,9 +112,9 @@ def _warn_of_cuda(lock: Lock, interpreter: Interpreter) -> None:
         return
     size = 0
     with contextlib.suppress(DependencyError, LockError):  # the installation will say what is wrong
-        found = pylock.listed(lock.packages, interpreter.path, lock.options)
+        packages = pylock.listed(lock.packages, interpreter.path, lock.options)
         size = sum(
-            max((wheel.size or 0 for wheel in package.wheels), default=0) for package in found
+            max((wheel.size or 0 for wheel in package.wheels), default=0) for package in packages
         )
     much = f" ({size_text(size)} of downloads)" if size else ""
     warnings.warn(
@@ -186,17 +192,17 @@ def locked_packages(snapshot: Snapshot, lock: LockFile) -> PackageSet:
     from envhub_sandbox.extras.packages import environments, interpreters
     from envhub_sandbox.extras.packages.locks import lockfile, making, pylock
 
-    here = making.with_files(lock, snapshot)
-    making.refuse(making.differences(lock, here), snapshot.label)
+    state = making.with_files(lock, snapshot)
+    making.refuse(making.differences(lock, state), snapshot.label)
     try:
         interpreter = interpreters.find(lock.runner.python)
-        here = replace(here, runner=lockfile.Runner.of(interpreter))
-        making.refuse(making.differences(lock, here), snapshot.label)
+        state = replace(state, runner=lockfile.Runner.of(interpreter))
+        making.refuse(making.differences(lock, state), snapshot.label)
         with log.progress_shown("packages") as tell:
             locked = [package.origin for package in lock.packages if package.origin is not None]
             pins = _with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)
-            made = environments.provide(pins, interpreter, tell)
-            return PackageSet.of(made)
+            environment = environments.provide(pins, interpreter, tell)
+            return PackageSet.of(environment)
     except (DependencyError, LockError) as error:
         name_source(error, snapshot.label)
         raise

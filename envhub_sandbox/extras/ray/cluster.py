@@ -91,11 +91,11 @@ def _started_here(address: str) -> bool:
     return False
 
 
-def _check_address(address: str, there: str) -> None:
-    if address not in ("", "auto", "local", there) and "://" not in address:
+def _check_address(address: str, connected: str) -> None:
+    if address not in ("", "auto", "local", connected) and "://" not in address:
         raise PolicyError(
             f"RaySandbox(address={address!r}): this process is connected to the cluster at "
-            f"{there}. Leave the address out, or call ray.shutdown() first"
+            f"{connected}. Leave the address out, or call ray.shutdown() first"
         )
 
 

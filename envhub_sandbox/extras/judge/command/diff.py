@@ -60,21 +60,21 @@ def diff(
         for ref in (then, now):
             bar.begin(f"reading {ref}")
             read.append(static(make.snapshot(ref)))
-        found = changes.changes(read[0], read[1])
+        changes_found = changes.changes(read[0], read[1])
         if run:
             kwargs = make["env_kwargs"]
             tasks = []
             for repository in read:
                 bar.begin(f"loading {repository.reference} in a sandbox")
                 tasks.append(_tasks(repository.snapshot, kwargs, make.source))
-            found += changes.environments(tasks[0], tasks[1])
+            changes_found += changes.environments(tasks[0], tasks[1])
     if json:
-        print_json(changes.document(read[0], read[1], found))
+        print_json(changes.document(read[0], read[1], changes_found))
     else:
-        _print(read[0].reference, read[1].reference, found)
-    if least is None and found:
+        _print(read[0].reference, read[1].reference, changes_found)
+    if least is None and changes_found:
         raise typer.Exit(Exit.DIFFERENT)
-    if least and any(change.weighs(least) for change in found):
+    if least and any(change.weighs(least) for change in changes_found):
         raise typer.Exit(Exit.ENVIRONMENT)
 
 

@@ -74,8 +74,8 @@ FILMED = ("rgb_array", "rgb_array_list")
 def other_modes(env: VectorEnv[Any, Any, Any]) -> list[str]:
     """The modes that it declares and is not in. Trust: input from the worker."""
     declared = env.metadata.get("render_modes")
-    given = declared if isinstance(declared, (list, tuple)) else ()
-    named = {mode for mode in given if isinstance(mode, str)}
+    declared_modes = declared if isinstance(declared, (list, tuple)) else ()
+    named = {mode for mode in declared_modes if isinstance(mode, str)}
     return [mode for mode in MODES if mode in named and mode != env.render_mode]
 
 
@@ -84,11 +84,11 @@ def wrong_frames(env: VectorEnv[Any, Any, Any]) -> Iterator[str]:
     mode = env.render_mode
     if mode not in MODES:
         return
-    given = env.render()
-    if not isinstance(given, (tuple, list)) or len(given) != env.num_envs:
-        yield f"{mode}: render() gave {shown(given)}, not one result for each sub-environment"
+    rendered = env.render()
+    if not isinstance(rendered, (tuple, list)) or len(rendered) != env.num_envs:
+        yield f"{mode}: render() gave {shown(rendered)}, not one result for each sub-environment"
         return
-    for index, result in enumerate(given):
+    for index, result in enumerate(rendered):
         if not _fits(result, mode):
             yield f"{mode}: sub-environment {index} gave {shown(result)}"
             return

@@ -231,11 +231,11 @@ class TaskJudge:
         They outlive each reset by design, so they are stopped while plays are compared. Of nested
         wrappers only the outermost can be stopped from here.
         """
-        found = sum(probes.is_statistics(env, name) for name in _STATISTICS)
-        if found and probes.has(env, "update_running_mean"):  # older releases lack it
+        learning = sum(probes.is_statistics(env, name) for name in _STATISTICS)
+        if learning and probes.has(env, "update_running_mean"):  # older releases lack it
             env.set_attr("update_running_mean", [False] * env.num_envs)  # type: ignore[attr-defined]
-            return found - 1
-        return found or None
+            return learning - 1
+        return learning or None
 
     def _endless(self, env: Env) -> None:
         """Look for an end of an episode; where there is no time, for a limit that is stated."""

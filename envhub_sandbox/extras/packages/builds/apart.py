@@ -78,10 +78,10 @@ def main(owner: int) -> int:
         resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
     order = json.load(sys.stdin)
     try:
-        said = {"answer": _carried_out(order)}
+        answer = {"answer": _carried_out(order)}
     except EnvHubError as error:
-        said = {"error": str(error), "reason": getattr(error, "reason", "")}
-    print(json.dumps(said))
+        answer = {"error": str(error), "reason": getattr(error, "reason", "")}
+    print(json.dumps(answer))
     return 0
 
 

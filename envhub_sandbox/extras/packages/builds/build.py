@@ -125,15 +125,15 @@ def build_wheels(
 def _wheel(source: Source, interpreter: Interpreter, tell: Tell, choose: Choose) -> Path:
     if source.commit:
         source = replace(source, commit=download.resolve(source.url, source.commit))
-    known = wheels.recall(source, interpreter)
-    if known is not None:
-        wheels.named(known.name, source.name, source.version)  # one commit, asked for as another
-        return known
+    kept = wheels.recall(source, interpreter)
+    if kept is not None:
+        wheels.named(kept.name, source.name, source.version)  # one commit, asked for as another
+        return kept
     with _under_way(source), tempfile.TemporaryDirectory(prefix="envhub-build-") as place:
         Path(place).chmod(0o755)  # a jail's user is another one
         tree = _fetched(source, Path(place), tell)
-        said = project.read(tree, _title(source))
-        return _Build(source, said, tree, Path(place), interpreter, tell, choose).wheel()
+        declared = project.read(tree, _title(source))
+        return _Build(source, declared, tree, Path(place), interpreter, tell, choose).wheel()
 
 
 @contextmanager
@@ -171,15 +171,15 @@ def _fetched(source: Source, place: Path, tell: Tell) -> Path:
 
 
 def _below(tree: Path, source: Source) -> Path:
-    found = tree
+    folder = tree
     for step in filter(None, source.subdirectory.split("/")):
-        if step in (".", "..") or not (found / step).is_dir():
+        if step in (".", "..") or not (folder / step).is_dir():
             raise DependencyError(
                 f"{_title(source)} has no folder {source.subdirectory[:200]!r}. {source.where}",
                 reason="requirement",
             )
-        found = found / step
-    return found
+        folder = folder / step
+    return folder
 
 
 def _title(source: Source) -> str:
@@ -231,12 +231,12 @@ class _Build:
             self._tell(f"building {_title(self._source)} in a jail")
             folder = Path(tempfile.mkdtemp(prefix=f"try-{number}-", dir=self._place))
             folder.chmod(0o755)
-            found = _in_jail(self._order(packages, known), folder)
-            if isinstance(found, Path):
+            result = _in_jail(self._order(packages, known), folder)
+            if isinstance(result, Path):
                 source, interpreter = self._source, self._interpreter
-                apart.check_wheel(found, source.name, source.version, interpreter)
-                return wheels.keep(found, self._source, lock, self._interpreter)
-            known = (*known, *found)
+                apart.check_wheel(result, source.name, source.version, interpreter)
+                return wheels.keep(result, self._source, lock, self._interpreter)
+            known = (*known, *result)
         raise BuildFailedError("its backend never has all that it needs")
 
     def _environment(self, further: Iterable[str]) -> tuple[Path, str]:
@@ -275,11 +275,12 @@ class _Build:
         return environment.python, str(environment.packages)
 
     def _failed(self, log: str) -> DependencyError:
-        source, said = self._source, project.advice(log)
+        source, advice = self._source, project.advice(log)
+        advice = f"{advice}. " if advice else ""
         needed_by = f" ({source.where})" if source.where else ""
         return DependencyError(
             f"{_title(source)}{needed_by} has no wheel for Python {self._interpreter.version}, and "
-            f"building its source in a jail failed. {said + '. ' if said else ''}The build says:\n"
+            f"building its source in a jail failed. {advice}The build says:\n"
             f"{log}",
             reason="resolution",
         )

@@ -28,12 +28,12 @@ class Project:
 def read(tree: Path, title: str) -> Project:
     """What the sources say; where they say nothing, setuptools builds them."""
     where = f"[build-system] of {title}"
-    said = pyproject(tree, where).get("build-system", {})
-    if not isinstance(said, dict):
+    build_system = pyproject(tree, where).get("build-system", {})
+    if not isinstance(build_system, dict):
         raise DependencyError(f"{where} is no table", reason="requirement")
-    requires = _texts(said.get("requires", list(_LEGACY)), where)
-    backend = said.get("build-backend", _LEGACY_BACKEND)
-    paths = _texts(said.get("backend-path", []), where)
+    requires = _texts(build_system.get("requires", list(_LEGACY)), where)
+    backend = build_system.get("build-backend", _LEGACY_BACKEND)
+    paths = _texts(build_system.get("backend-path", []), where)
     if not isinstance(backend, str) or not all(
         map(str.isidentifier, backend.replace(":", ".", 1).split("."))
     ):

@@ -77,7 +77,7 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
     An empty version stands for any. Raises ``DependencyError``.
     """
     try:
-        found = named(wheel.name, name, version)
+        version_found = named(wheel.name, name, version)
         _fits(wheel.name, interpreter)
         if wheel.stat().st_size > MAX_BYTES:
             raise not_as_expected(f"it has more than {size_text(MAX_BYTES)}")
@@ -86,7 +86,7 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
             zipfile.ZipFile(BoundedStream(file, "it", MAX_TABLE)) as archive,
         ):
             _files(archive)
-            info = _info(archive, name, found)
+            info = _info(archive, name, version_found)
             _record(archive, f"{info}/RECORD")
     except (*_UNREADABLE, SnapshotError, DependencyError) as error:
         said = printable(str(error), 300)
@@ -99,17 +99,17 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
 def named(file: str, name: str, version: str) -> Version:
     """The version of a wheel, by the name of its file. Raises ``DependencyError``."""
     try:
-        found, number, _, _ = parse_wheel_filename(file)
+        distribution, number, _, _ = parse_wheel_filename(file)
         wanted = Version(version) if version else number
     except (InvalidWheelFilename, InvalidVersion) as error:
         raise not_as_expected(f"its name says nothing: {error}") from error
-    if found != canonicalize_name(name) or number != wanted:
-        raise not_as_expected(f"it is {found} {number}, and not {name} {wanted}")
+    if distribution != canonicalize_name(name) or number != wanted:
+        raise not_as_expected(f"it is {distribution} {number}, and not {name} {wanted}")
     return number
 
 
 def _fits(file: str, interpreter: Interpreter) -> None:
-    _, _, _, found = parse_wheel_filename(file)
+    _, _, _, tags_found = parse_wheel_filename(file)
     major, minor = map(int, interpreter.version.split(".")[:2])
     platforms = list(tags.platform_tags())  # it was built on this machine
     short = f"cp{major}{minor}"
@@ -117,7 +117,7 @@ def _fits(file: str, interpreter: Interpreter) -> None:
         *tags.cpython_tags((major, minor), platforms=platforms),
         *tags.compatible_tags((major, minor), interpreter=short, platforms=platforms),
     }
-    if fitting.isdisjoint(found):
+    if fitting.isdisjoint(tags_found):
         raise not_as_expected(f"it does not fit Python {interpreter.version} on this machine")
 
 
@@ -134,18 +134,18 @@ def _files(archive: zipfile.ZipFile) -> None:
 def _info(archive: zipfile.ZipFile, name: str, version: Version) -> str:
     """Its one ``.dist-info``, which is that of the package and of the version."""
     tops = {name.partition("/")[0] for name in archive.namelist()}
-    found = [top for top in tops if top.endswith(".dist-info")]
-    if len(found) != 1:
-        raise not_as_expected(f"it holds {len(found)} folders .dist-info")
-    stem, _, number = found[0].removesuffix(".dist-info").rpartition("-")
+    folders_found = [top for top in tops if top.endswith(".dist-info")]
+    if len(folders_found) != 1:
+        raise not_as_expected(f"it holds {len(folders_found)} folders .dist-info")
+    stem, _, number = folders_found[0].removesuffix(".dist-info").rpartition("-")
     if canonicalize_name(stem) != canonicalize_name(name) or Version(number) != version:
-        raise not_as_expected(f"its metadata are those of {found[0]!r}")
-    fields = _fields(_small(archive, f"{found[0]}/METADATA"))
+        raise not_as_expected(f"its metadata are those of {folders_found[0]!r}")
+    fields = _fields(_small(archive, f"{folders_found[0]}/METADATA"))
     if canonicalize_name(fields.get("name", "")) != canonicalize_name(name):
         raise not_as_expected(f"its metadata name the package {fields.get('name', '')!r}")
     if Version(fields.get("version", "")) != version:
         raise not_as_expected(f"its metadata name the version {fields.get('version', '')!r}")
-    return found[0]
+    return folders_found[0]
 
 
 def _fields(data: bytes) -> dict[str, str]:
@@ -199,10 +199,10 @@ def root() -> Path:
 
 def recall(source: Source, interpreter: Interpreter) -> Path | None:
     """The wheel of a source that was built last for an interpreter; None where there is none."""
-    place = root() / _key(source, interpreter)
-    if not place.is_dir() or not folders.is_ours_alone(root()):
+    folder = root() / _key(source, interpreter)
+    if not folder.is_dir() or not folders.is_ours_alone(root()):
         return None
-    records = sorted(place.glob("[!.]*/built.json"), key=lambda record: -record.stat().st_mtime)
+    records = sorted(folder.glob("[!.]*/built.json"), key=lambda record: -record.stat().st_mtime)
     return next(filter(None, map(_whole, records)), None)
 
 
@@ -240,14 +240,14 @@ class KeptWheel:
 
 def every() -> list[KeptWheel]:
     """All of them, the latest used first."""
-    found = []
+    wheels = []
     for record in root().glob("*/[!.]*/built.json"):
         with contextlib.suppress(OSError, ValueError):
             [wheel] = record.parent.glob("*.whl")
             parse_wheel_filename(wheel.name)
             size, used = wheel.stat().st_size, record.stat().st_mtime
-            found.append(KeptWheel(wheel.name, size, used, record.parent))
-    return sorted(found, key=attrgetter("used"), reverse=True)
+            wheels.append(KeptWheel(wheel.name, size, used, record.parent))
+    return sorted(wheels, key=attrgetter("used"), reverse=True)
 
 
 def describe(wheel: Path) -> WheelOrigin | None:
@@ -260,16 +260,16 @@ def describe(wheel: Path) -> WheelOrigin | None:
 
 def keep(wheel: Path, source: Source, environment: str, interpreter: Interpreter) -> Path:
     """Keep a wheel that was checked, and return where it lies. Raises ``DependencyError``."""
-    place = root() / _key(source, interpreter)
+    folder = root() / _key(source, interpreter)
     public = replace(source, url=without_login(source.url), where="")
     built = WheelOrigin(public, environment, _hash(wheel).removeprefix("sha256:"))
     try:
         folders.make_private(root())
-        folders.make(place)
-        with draft(place) as building:
+        folders.make(folder)
+        with draft(folder) as building:
             shutil.copyfile(wheel, building / wheel.name)
             (building / "built.json").write_text(json.dumps(asdict(built)))
-            home = place / environment[:40]
+            home = folder / environment[:40]
             if home.exists() and _whole(home / "built.json") is None:
                 remove_tree(home)
             with contextlib.suppress(OSError):  # one that another has put there is as good

@@ -51,9 +51,9 @@ def of_its_day(snapshot: Snapshot, error: EnvHubError) -> str:
     """What to do about an error at a start that packages of the repository's day may cure; empty
     for others, and for what is of today.
     """
-    said, days = _said_at_start(error), days_for(snapshot, error)
+    text, days = _said_at_start(error), days_for(snapshot, error)
     for pattern, (requirement, broken) in _BROKEN_BY.items():
-        if re.search(pattern, said) and (not days or days[0] >= broken):
+        if re.search(pattern, text) and (not days or days[0] >= broken):
             # not "override": the others are then chosen to fit an earlier one
             older = option_name("dependencies", {"extra": [requirement]})
             return f"A later release of a package has broken it; {older} takes an earlier one"
@@ -80,15 +80,15 @@ def settled(snapshot: Snapshot, choice: Choice) -> Choice:
 
 def written(snapshot: Snapshot) -> str:
     """The day of its commit, its release or its newest file, ``"2024-05-31"``; empty if unknown."""
-    found = ""
+    day = ""
     with contextlib.suppress(EnvHubError, HubFailure, OSError, ValueError, LookupError):
         if snapshot.is_local:
-            found = _of_files(snapshot)
+            day = _of_files(snapshot)
         elif snapshot.repo_type == registered.KIND:
-            found = _of_release(snapshot)
+            day = _of_release(snapshot)
         elif snapshot.repo_type in (*REPO_TYPES, GIT):
-            found = _of_commit(snapshot)
-        return date.fromisoformat(found).isoformat()
+            day = _of_commit(snapshot)
+        return date.fromisoformat(day).isoformat()
     return ""
 
 
@@ -99,11 +99,11 @@ def days_for(snapshot: Snapshot, error: EnvHubError) -> list[str]:
     day = written(snapshot) if _may_be_outdated(error) else ""
     now = datetime.now(timezone.utc)
     then = datetime.fromisoformat(day or now.date().isoformat()).replace(tzinfo=timezone.utc)
-    found: list[str] = []
-    while now - then > _RECENT and len(found) < _MOST_DATES:
-        found.append(then.date().isoformat())
+    days: list[str] = []
+    while now - then > _RECENT and len(days) < _MOST_DATES:
+        days.append(then.date().isoformat())
         then += (now - then) / 2
-    return found
+    return days
 
 
 def _may_be_outdated(error: EnvHubError) -> bool:

@@ -156,10 +156,10 @@ def locked(snapshot: Snapshot, choice: Choice, *, upgrade: bool = False) -> Lock
     """A lock of a repository with the packages of a choice; nothing of either runs."""
     request = request_of(snapshot, replace(settled(snapshot, choice), where="own"))
     assert request is not None  # which only another choice gives
-    found = resolution_for(request, upgrade=upgrade)
+    resolution = resolution_for(request, upgrade=upgrade)
     empty = LockFile(
-        *("", "", "", {}, Runner.of(found.interpreter)),
-        packages=pylock.described(found.lock, found.interpreter.path),
+        *("", "", "", {}, Runner.of(resolution.interpreter)),
+        packages=pylock.described(resolution.lock, resolution.interpreter.path),
         extra=tuple(map(str, choice.extra)),
         only=None if choice.only is None else tuple(map(str, choice.only)),
         override=tuple(map(str, choice.override)),
@@ -167,7 +167,7 @@ def locked(snapshot: Snapshot, choice: Choice, *, upgrade: bool = False) -> Lock
         inferred=tuple(
             f"{guess.wanted.requirement} ({guess.wanted.where})"
             for guess in request.guesses
-            if guess.module in found.taken
+            if guess.module in resolution.taken
         ),
         exclude_newer=request.exclude_newer,
     )
@@ -200,8 +200,8 @@ def relisted(lock: LockFile) -> LockFile:
     ]
     interpreter = interpreters.find(lock.runner.python)
     options = pylock.pins(lock.packages).options
-    found = pylock.listed(pins, interpreter.path, options, refresh=True)
-    packages = tuple(sorted((*built, *found), key=attrgetter("name")))
+    listed = pylock.listed(pins, interpreter.path, options, refresh=True)
+    packages = tuple(sorted((*built, *listed), key=attrgetter("name")))
     return replace(lock, packages=packages)
 
 
@@ -217,13 +217,15 @@ def with_spaces(
 
 def tasks_of(suites: Mapping[str, Mapping[Any, Any]]) -> tuple[TaskFingerprint, ...]:
     """What a repository's ``make_env`` returned, in a form that can be compared."""
-    found = []
+    fingerprints = []
     for suite, tasks in suites.items():
         for task, env in tasks.items():
             mode = env.metadata.get("autoreset_mode")
             spaces = env.single_observation_space, env.single_action_space
-            found.append(fingerprint_of_task(suite, task, getattr(mode, "value", mode), *spaces))
-    return tuple(found)
+            fingerprints.append(
+                fingerprint_of_task(suite, task, getattr(mode, "value", mode), *spaces)
+            )
+    return tuple(fingerprints)
 
 
 def fingerprint_of_task(

@@ -83,11 +83,11 @@ def described(lock: Lock, python: str) -> tuple[PylockPackage, ...]:
     Raises ``DependencyError`` where no file of a package is one that the pins permit.
     """
     versions = [line.partition(" ")[0] for line in lock.text.splitlines()]
-    found = listed(versions, python, lock.options)
+    available = listed(versions, python, lock.options)
     permitted = set(re.findall(r"--hash=sha256:([0-9a-f]{64})", lock.text))
     built = _origins(lock)
     kept = []
-    for package in found:
+    for package in available:
         origin = next(
             (built[wheel.sha256] for wheel in package.wheels if wheel.sha256 in built), None
         )
@@ -139,11 +139,11 @@ def read(document: Mapping[str, Any], where: str) -> tuple[PylockPackage, ...]:
     given = document.get("packages")
     if not isinstance(given, list) or len(given) > MAX_PACKAGES:
         raise LockError(f"packages in {where} is not a list of at most {MAX_PACKAGES}")
-    found = [_package(row, where) for row in given]
-    names = [package.name for package in found]
+    packages = [_package(row, where) for row in given]
+    names = [package.name for package in packages]
     if len(set(names)) != len(names):
         raise LockError(f"{where} names a package twice; a lock of envhub is for one interpreter")
-    return tuple(sorted(found, key=attrgetter("name")))
+    return tuple(sorted(packages, key=attrgetter("name")))
 
 
 def _package(given: object, where: str) -> PylockPackage:
@@ -219,8 +219,8 @@ def _origins(lock: Lock) -> dict[str, WheelOrigin]:
     """What was built here of the packages of a lock, by the hash of the wheel."""
     folders = [Path(option) for option in lock.options if option.startswith("/")]
     wheels = [wheel for folder in folders for wheel in folder.glob("*.whl")]
-    found = [built for built in map(describe, wheels) if built is not None]
-    return {origin.wheel: origin for origin in found}
+    origins = [built for built in map(describe, wheels) if built is not None]
+    return {origin.wheel: origin for origin in origins}
 
 
 def written(packages: Sequence[PylockPackage]) -> str:
