@@ -109,7 +109,7 @@ smoke() {
   (
     cd "$CI_WORK/$name/checkout"
     with_summary "$name" bash "$CI_AGAIN" "$CI_WORK/$name/bin/python" -m pytest \
-      -n "$(processes)" --dist worksteal --one-case \
+      -n logical --maxprocesses 8 --dist worksteal --one-case \
       tests/unit/{cli,protocol,client/{hub,transport,vector},worker/runner} tests/integration/hub \
       tests/integration/test_examples.py tests/compliance/test_parity.py::TestCounter
   )

@@ -29,7 +29,7 @@ part() {
   local again=(bash "$CI_STEPS/../as-user.sh" "$number" bash "$CI_AGAIN")
   shift
   if [ -x "$made/venv/bin/python" ]; then
-    cp -R "$made/checkout" "$CI_WORK/user-$number"
+    cp -Rp "$made/checkout" "$CI_WORK/user-$number"  # with times, by which its bytecode is known
     cd "$CI_WORK/user-$number"
     with_summary "user-$number" "${again[@]}" "$made/venv/bin/python" -m pytest -n 1 \
       --one-case "$@"
