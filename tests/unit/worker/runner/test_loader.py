@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from envhub_worker.protocol.messages import CONFIG_CLASS
 from envhub_worker.runner.loader import ConfigMapping, config_of
+from tests.support.command_line import python
 
 
 @dataclasses.dataclass
@@ -50,3 +52,28 @@ def test_what_cannot_be_made_is_named() -> None:
     said = described(("arena", "Bad"), fields=("not a name",), **{"not a name": 1})
     with pytest.raises(TypeError, match=r"no Bad can be made of not a name"):
         config_of(said)
+
+
+_IMPORTS = """
+import sys
+from pathlib import Path
+import numpy as np
+from envhub_worker.protocol import messages as m
+from envhub_worker.runner.loader import PACKAGE
+from envhub_worker.spawn import zygote
+from tests.support.in_process.runner_here import RunnerHere
+
+zygote.preload("envhub_worker.runner.runner")
+before = set(sys.modules)
+runner = RunnerHere(Path(sys.argv[1]))
+runner.ask(m.Reset(1, (1, 2), None, None))
+runner.ask(m.Step(1, np.zeros(2, np.int64)))
+print([name for name in sys.modules.keys() - before if name.partition(".")[0] != PACKAGE])
+"""
+
+
+def test_a_runner_imports_nothing_that_the_zygote_has_not() -> None:
+    """What each runner imports for itself takes time at each start, and memory of its own."""
+    root = Path(__file__).parents[4]
+    done = python("-c", _IMPORTS, root / "tests" / "samples" / "counter", cwd=root)
+    assert done.stdout == "[]\n"
