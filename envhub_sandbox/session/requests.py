@@ -14,7 +14,7 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
@@ -237,13 +237,6 @@ class RequestOrder(ABC):
             self._repository.warnings.show(self._repository.label)
 
 
-class Packed(NamedTuple):
-    """A request to record, and the one to send in its place, which is mostly the same."""
-
-    request: Request
-    sent: Request
-
-
 class Requests(RequestOrder):
     """The requests to one jail, which is opened by the first of them."""
 
@@ -309,13 +302,13 @@ class Requests(RequestOrder):
             if self.lifecycle.state is not State.READY:
                 self._make_ready(operation)
             try:
-                packed = self.pack(operation, message_for, instead)
+                request = self.pack(operation, message_for, instead)
             except LocalProtocolError:
                 if len(self.results.bounds) > 1:
                     self.refuse_whole(operation, message_for, self.results.manifest.num_envs)
                 raise
-            self._send_packed(operation, packed)
-            self._recorder.requested(packed.request)
+            self._send_packed(operation, request)
+            self._recorder.requested(request)
 
     def make_ready(self, operation: str, start: Callable[[], object] | None = None) -> None:
         """With the lock held, open the jail if there is none; raises as ``submit`` does.
@@ -330,23 +323,23 @@ class Requests(RequestOrder):
 
     def pack(
         self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
-    ) -> Packed:
+    ) -> Request:
         """Encode a request without sending it. Raises ``LocalProtocolError``."""
-        lane = self._lane()
-        request = self._request(lane, operation, message_for)
-        sent = request if instead is None else self._request(lane, operation, instead)
-        return Packed(request, sent)
+        request = self._request(operation, message_for)
+        if instead is not None:
+            request.sent = self._request(operation, instead).frames
+        return request
 
-    def submit_packed(self, operation: str, packed: Packed) -> None:
+    def submit_packed(self, operation: str, request: Request) -> None:
         """Send a packed request; the caller records it. Raises as ``submit`` does."""
         with self._sending(operation):
-            self._send_packed(operation, packed)
+            self._send_packed(operation, request)
 
-    def _send_packed(self, operation: str, packed: Packed) -> None:
+    def _send_packed(self, operation: str, request: Request) -> None:
         with self._outgoing(operation):
-            self._lane().send(packed.sent)
+            self._lane().send(request)
         if self._recovery is not None:
-            self._recovery.sent(packed.request)
+            self._recovery.sent(request)
         if self._prewarm.first_use is not None:
             self._prewarm.note_use()
 
@@ -359,8 +352,8 @@ class Requests(RequestOrder):
         with self._sending(operation), self._outgoing(operation, submit=ready):
             lane.send_some(operation, lane.runners, [lane.jail.pack(message)], ahead=True)
 
-    def _request(self, lane: Lane, operation: str, message_for: MessageFor) -> Request:
-        bounds = self.results.bounds
+    def _request(self, operation: str, message_for: MessageFor) -> Request:
+        lane, bounds = self._lane(), self.results.bounds
         messages = [message_for(lane.number, each) for each in bounds]
         return lane.jail.request(operation, messages, bounds)
 
@@ -432,7 +425,7 @@ class Requests(RequestOrder):
 
     # --- steps ---------------------------------------------------------------------------------
 
-    def submit_step(self, actions: Any, packed: Packed | None = None) -> None:
+    def submit_step(self, actions: Any, packed: Request | None = None) -> None:
         """Send a validated batch of actions, with the lock held; raises as ``submit`` does.
 
         ``packed`` is the request, if it was encoded already because the actions have no layout.
@@ -454,7 +447,7 @@ class Requests(RequestOrder):
                 if packed is None:
                     lane.send_step(actions)
                 else:
-                    lane.send(packed.sent)
+                    lane.send(packed)
             except BaseException as error:
                 with self.use.hold("step"):
                     self._nothing_was_sent(error)

@@ -54,9 +54,11 @@ class Request:
         frames: Those of each message.
         bounds: The slices of the sub-environments, one for each shard.
         plain: Whether no value in them had to be pickled.
+
+    ``sent``: the frames to send, if others than those to record.
     """
 
-    __slots__ = ("_kept", "bounds", "frames", "messages", "operation", "plain")
+    __slots__ = ("_kept", "bounds", "frames", "messages", "operation", "plain", "sent")
 
     def __init__(
         self,
@@ -69,7 +71,7 @@ class Request:
     ) -> None:
         self.operation = operation
         self.messages = messages
-        self.frames = frames
+        self.frames = self.sent = frames
         self.bounds = bounds
         self.plain = plain
         self._kept: list[list[bytes]] | None = None

@@ -136,7 +136,7 @@ class Lane:
             EnvHubError: Nothing was sent.
         """
         self._asked_ns = perf_counter_ns()
-        self._send_to_all(request.operation, request.frames)
+        self._send_to_all(request.operation, request.sent)
 
     def _send_to_all(
         self, operation: str, packed: Sequence[Frames], *, ahead: bool = False

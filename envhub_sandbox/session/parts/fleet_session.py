@@ -33,7 +33,6 @@ from envhub_sandbox.session.recovery import mark_revived
 from envhub_sandbox.session.requests import (
     MessageFor,
     OneMessageFor,
-    Packed,
     RequestOrder,
     Requests,
 )
@@ -320,7 +319,7 @@ class FleetRequests(RequestOrder):
         self._counters.requests += 1
         self._recorder.step(actions)
 
-    def _packed(self, actions: Any, rows: Sequence[Any]) -> Sequence[Packed | None]:
+    def _packed(self, actions: Any, rows: Sequence[Any]) -> Sequence[Request | None]:
         """Each worker's encoded step; nothing is sent unless all can be.
         Raises ``LocalProtocolError``, with the position in all of the ``actions``.
         """
@@ -460,9 +459,8 @@ def _step(actions: Any, number: int, bounds: tuple[int, int]) -> m.Message:
     return m.Step(number, actions)
 
 
-def _joined(packed: Sequence[Packed], bounds: Sequence[tuple[int, int]]) -> Request:
+def _joined(requests: Sequence[Request], bounds: Sequence[tuple[int, int]]) -> Request:
     """The parts' requests as one, to be recorded."""
-    requests = [part.request for part in packed]
     return Request(
         requests[0].operation,
         [message for request in requests for message in request.messages],

@@ -74,7 +74,7 @@ class FakeLane:
         os.write(self._bell[1], b"!")
 
     def send(self, request: Request) -> None:
-        self._owe(request.messages[0])
+        self._owe(m.unpack([bytes(frame) for frame in request.sent[0]]))
 
     def expect_more(self) -> None:
         """It takes no more."""
