@@ -1,7 +1,7 @@
-"""What confined a repository while it was judged, and what it tried and was denied.
+"""What confined a repository while it was judged, and what it was denied.
 
-The system call filter asks the jail's first process, so that nothing of it is the repository's
-word; but a path is read out of the memory of the process that asks, which may change it meanwhile.
+Denials come from the jail's first process, which the system call filter asks, and not from the
+repository; but it may change a path in its memory while that is read.
 """
 
 from __future__ import annotations

@@ -129,8 +129,8 @@ def _advice(render_mode: str | None) -> str:
 
 @contextlib.contextmanager
 def video_writer(path: Path, fps: float) -> Iterator[Callable[[Frame], None]]:
-    """Write one file: gives what appends a frame as ``first_frame`` gives it, or raises
-    ``VideoError``. What was written when this ends can be played.
+    """Write a video that can be played afterwards; gives a function that appends a frame as
+    ``first_frame`` makes it, or raises ``VideoError``.
     """
     import imageio_ffmpeg  # type: ignore[import-untyped]
 
@@ -235,10 +235,7 @@ def facts_of(env: VectorEnv[Any, Any, Any]) -> dict[str, str]:
 
 
 def film(env: VectorEnv[Any, Any, Any], *, seed: int, seconds: float = _SECONDS) -> Film:
-    """Play again from the start, and look: bounded in frames and in time, encoded here.
-
-    What fails is said in the film and is no finding: its checks have been made.
-    """
+    """Play again and render, bounded in frames and in time; the film says what failed."""
     frames: list[Frame] = []
     lacks = ""
     try:

@@ -1,8 +1,8 @@
 """``sandbox=None``: the repository's code in the caller's own process, exactly as LeRobot does.
 
-Nothing protects the caller here. Followed: ``lerobot.envs.utils._download_hub_file``,
-``_import_hub_module``, ``_call_make_env``, ``_normalize_hub_result``; the files come from a
-verified snapshot all the same.
+Nothing protects the caller here, but the files come from a verified snapshot. Followed:
+``lerobot.envs.utils._download_hub_file``, ``_import_hub_module``, ``_call_make_env`` and
+``_normalize_hub_result``.
 """
 
 from __future__ import annotations

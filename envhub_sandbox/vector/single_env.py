@@ -334,10 +334,10 @@ class SingleEnv(gym.Env[Any, Any]):
 
 
 def info_of(infos: dict[Any, Any], index: int, num_envs: int) -> dict[Any, Any]:
-    """The info of sub-environment ``index``.
+    """The info of sub-environment ``index``: the inverse of ``VectorEnv._add_info``.
 
-    The other way round from ``VectorEnv._add_info``: a key counts where its mask, ``"_" + key``,
-    bool ``(num_envs,)``, is set, and mappings are nested. Keys may be numbers, as in Gymnasium.
+    A key counts if its mask, ``"_" + key``, bool ``(num_envs,)``, is set; mappings are nested. Keys
+    may be numbers, as in Gymnasium.
     """
     info = {}
     masks = {f"_{key}" for key in infos}

@@ -181,9 +181,7 @@ def choose(
     suites: EnvSuites, suite: str | None = None, task: int | str | None = None
 ) -> VectorEnv[Any, Any, Any]:
     """The one environment of this suite and this task; None is whichever there is.
-
-    Raises:
-        ValueError: There is not exactly one; the text names what there is.
+    Raises ``ValueError``: there is not exactly one; the text names what there is.
     """
     chosen = _named(suites, suite, (task,))
     if len(chosen) == 1:
@@ -197,10 +195,8 @@ def choose(
 
 
 def keep_only(suites: EnvSuites, suite: str | None = None, task: int | str | None = None) -> None:
-    """Close and drop all but this suite and this task; a task is also found by its text.
-
-    Raises:
-        ValueError: Nothing would be left; the text names what there is.
+    """Close and drop all but this suite and this task, which may be given as text.
+    Raises ``ValueError``: nothing would be left; the text names what there is.
     """
     ids = [task_id for _, task_id in _named(suites, suite) if task in (task_id, str(task_id))]
     chosen = _named(suites, suite, (task, *ids))
@@ -229,15 +225,8 @@ def _names(tasks: list[tuple[str, int | str]]) -> str:
 
 
 def live_tasks(memory: int | str | None, max_live_tasks: int | None, each_bytes: int) -> int:
-    """How many tasks may have processes at once.
-
-    Args:
-        memory: Bytes for all of them, or a text such as ``"16G"``.
-        max_live_tasks: The most, whatever they take.
-        each_bytes: What one may take.
-
-    Raises:
-        ValueError: Neither is given, or not even one task fits.
+    """How many tasks of ``each_bytes`` may have processes at once: see ``EnvSuites.map``.
+    Raises ``ValueError``: there is no bound, or not even one task fits.
     """
     if memory is None and max_live_tasks is None:
         raise ValueError("map() takes max_live_tasks=, memory=, or both")

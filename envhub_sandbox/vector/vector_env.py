@@ -48,8 +48,8 @@ _OURS = frozenset({"prewarm", "recv", "sandbox", "send", "send_reset"})
 
 
 class VectorApart(NamedTuple):
-    """``reset``, ``step`` and ``step_wait`` with infos as they came, and what reads these of
-    ``Results``. ``reset`` takes seeds, options and a mask.
+    """``reset`` (of seeds, options and a mask), ``step`` and ``step_wait`` with infos as they came,
+    and the functions of ``Results`` that read such infos.
     """
 
     reset: Callable[..., tuple[Any, dict[Any, Any]]]
@@ -92,7 +92,8 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         self.metadata = metadata_of(manifest, whole=session.repository.for_lerobot)
         self.render_mode = manifest.render_mode
         # as in Gymnasium, where a SyncVectorEnv has none
-        self.spec = self._spec_again(manifest.spec) if self._has_spec else None
+        has_spec = not manifest.shardable and manifest.spec is not None
+        self.spec = self._spec_again(manifest.spec) if has_spec else None
         if manifest.shardable:  # a repository's own class has others, or none
             self.autoreset_mode = self.metadata.get("autoreset_mode")
             self.copy = session.repository.copy
@@ -184,7 +185,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
             self._requests.waiting = "reset"
 
     def _note_first_use(self) -> None:
-        """Before the lock, which a start ahead has: meanwhile the next one may start."""
+        """Tell of the first use before taking the lock, which a start ahead may hold for long."""
         self._open_again()
         for prewarm in self._session.prewarms:
             if prewarm.starting is not None and not self.closed:
@@ -517,18 +518,13 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     __html__ = _repr_html_
 
-    @property
-    def _has_spec(self) -> bool:
-        return not self._manifest.shardable and self._manifest.spec is not None
-
     def _spec_again(self, facts: dict[str, Any] | None) -> EnvSpec:
         recipe = self._session.repository.recipe
         return recipe.spec(self._manifest.suite, self._manifest.task, facts)
 
     def _apart(self) -> VectorApart | None:
-        """How libraries of single environments use it: infos are each one's own from now on.
-
-        None where the repository's own class joins them, or where it cannot be asked now.
+        """For libraries of single environments, whose infos are each one's own from now on; None
+        if the repository's own class joins them, or cannot be asked now.
         """
         if not self._manifest.shardable:
             return None
@@ -553,17 +549,13 @@ def _one_for_lerobot(recipe: Recipe, suite: str, task: int | str) -> SandboxVect
 
 
 def leave_suite(env: SandboxVectorEnv) -> None:
-    """Have its first use start no other task of its suite: ``EnvSuites.map`` does that."""
+    """Have its first use start no other task of its suite, since ``EnvSuites.map`` does."""
     for prewarm in env._session.prewarms:
         prewarm.on_first_use(None, lambda: False)
 
 
 def refuse_limit(env: SandboxVectorEnv, steps: int | None) -> None:
-    """Refuse another limit of an episode's steps than the repository's own, for which None stands.
-
-    Raises:
-        ValueError: It is another one.
-    """
+    """Raise ``ValueError`` for a limit of an episode's steps that is not the repository's own."""
     own = env._spec_again(env._manifest.spec).max_episode_steps
     if steps not in (None, own):
         raise ValueError(
@@ -573,10 +565,9 @@ def refuse_limit(env: SandboxVectorEnv, steps: int | None) -> None:
 
 
 def metadata_of(manifest: EnvManifest, *, whole: bool = False) -> dict[str, Any]:
-    """With the autoreset mode as Gymnasium's enum where it has one. Trust: the worker's words.
+    """The metadata with Gymnasium's enum for the autoreset mode. Trust: the worker's words.
 
-    What writes LeRobot's videos takes integers for ``render_fps``: 20.0 is one, and with ``whole``
-    the nearest one to 12.5.
+    LeRobot writes videos with an integer ``render_fps``: 20.0 is one, 12.5 only with ``whole``.
     """
     metadata = dict(manifest.metadata)
     rate = metadata.get("render_fps")

@@ -168,9 +168,7 @@ class SandboxedEnvConfig(EnvConfig):
 
     @property
     def gym_id(self) -> str:
-        """Raises ``RuntimeError``: only a LeRobot that asks no configuration for environments looks
-        at it.
-        """
+        """Raise ``RuntimeError``: only a LeRobot that asks no configuration reads it."""
         raise RuntimeError(
             "this version of LeRobot does not let a configuration make its environments: run "
             "lerobot-eval-sandboxed instead of lerobot-eval, or call "
@@ -261,9 +259,9 @@ def _on_lerobots_command_line() -> bool:
 
 
 def _expected() -> tuple[int, bool]:
-    """How many sub-environments LeRobot's command line is about to ask for, and whether async.
+    """How many sub-environments LeRobot's command line will ask for, and whether async.
 
-    A guess, to open one jail instead of two: where another number is asked for, another is opened.
+    A guess, to open one jail instead of two; another number opens another jail.
     """
     if parser.parse_arg("env.repo") is None:
         return 1, False

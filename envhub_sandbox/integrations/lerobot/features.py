@@ -67,12 +67,8 @@ def steps_for(
     observations: Space[Any], metadata: Mapping[str, Any], keys: Mapping[str, str | None]
 ) -> list[Step]:
     """The steps that the repository names, else LeRobot's own for observations of this form.
-
-    Args:
-        observations: The space of one sub-environment's.
-        metadata: The environment's. Trust: the worker's words.
-        keys: ``state_keys`` and ``camera_keys`` of a caller who chooses, as IsaaclabArenaEnv takes
-            them.
+    ``metadata``: the environment's. Trust: the worker's words.
+    ``keys``: the caller's ``state_keys`` and ``camera_keys``, as IsaaclabArenaEnv takes them.
     Raises ``ValueError``: the repository names a step that it may not name, or that is not so
     configured.
     """
@@ -125,11 +121,11 @@ def _is_configured(config: object, kinds: Mapping[str, type[Any]]) -> bool:
 def features_of(
     observations: Space[Any], actions: Space[Any], steps: list[Step], *, others: bool
 ) -> dict[str, Feature]:
-    """The features, by keys of the observation, or, for one of several cameras, by what LeRobot
-    calls it when it records.
+    """The features by keys of the observation, or, for one of several cameras, by the name that
+    LeRobot records it under.
 
-    What LeRobot has no tensor for is left out: actions that are not a vector too, which its
-    evaluation does not give. ``others``: whether this LeRobot hands on vectors of other names.
+    Observations without a tensor in LeRobot are left out, and actions that are not a vector.
+    ``others``: whether this LeRobot passes on vectors of other names.
     """
     inner = observations.spaces if isinstance(observations, Dict) else {}
     seen = {key: item for name in inner for key, item in _passed_on(name, inner[name], others)}
