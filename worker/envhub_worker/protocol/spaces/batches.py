@@ -75,6 +75,8 @@ def _item(index: Any, space: gym.Space[Any], batch: Any) -> Any:
 
 def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
     """The slices of a batch. Arrays are views."""
+    if isinstance(space, ARRAY_SPACES):  # in each step of several workers
+        return [batch[start:stop] for start, stop in bounds]
     return [_mapped(partial(_item, slice(*window)), space, batch) for window in bounds]
 
 
@@ -108,6 +110,8 @@ def _reordered(order: Sequence[int], space: gym.Space[Any], batch: Any) -> Any:
 
 def join(space: gym.Space[Any], parts: Sequence[Any]) -> Any:
     """One batch out of the shards' slices, in order."""
+    if isinstance(space, ARRAY_SPACES):  # in each step of several workers
+        return np.concatenate(parts)
     return _mapped(_joined, space, *parts)
 
 
