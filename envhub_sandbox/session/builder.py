@@ -11,6 +11,7 @@ import itertools
 import threading
 import weakref
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from envhub_sandbox.errors import LoadError, remote_error
@@ -235,11 +236,10 @@ class Builder:
         """
         server = loaded.server
         if server.fd_path is None or self._repository.policy.lane == "frames":
-            if not self._own:
-                return relay  # a server has one pair of slabs for each runner
             from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 
-            return ServedLane.open(relay, deadline)
+            # a server has the slabs of one environment for each runner
+            return (ServedLane.open(relay, deadline) if self._own else None) or relay
         # late, for Linux alone has what they import
         from envhub_sandbox.transport.shared_memory.attachment import Attachment
         from envhub_sandbox.transport.shared_memory.client_slabs import RING
@@ -247,12 +247,9 @@ class Builder:
         from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 
         slots = 1 if self._repository.copy else 1 + RING
-        for kind in (ColumnLane, SharedMemoryLane):
-            attachment = Attachment(server.fd_path, loaded.jail.number, server.process_fd)
-            lane = kind.open(relay, attachment, deadline, slots=slots)
-            if lane is not None:
-                return lane
-        return relay
+        attach = partial(Attachment, server.fd_path, loaded.jail.number, server.process_fd)
+        lane = ColumnLane.open(relay, attach, deadline, slots=slots)
+        return lane or SharedMemoryLane.open(relay, attach, deadline, slots=slots) or relay
 
     def _check_manifest(self, loaded: LoadedJail) -> None:
         key = (self._manifest.suite, self._manifest.task)

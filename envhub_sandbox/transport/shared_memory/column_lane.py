@@ -5,7 +5,7 @@ A step costs one wake-up per shard and one copy out. Infos that did not fit go o
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from time import perf_counter_ns
 from typing import Any
 
@@ -57,18 +57,16 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
 
     @classmethod
     def open(
-        cls, relay: Lane, attachment: Attachment, deadline: Deadline, *, slots: int
-    ) -> ColumnLane | None:
+        cls, relay: Lane, attach: Callable[[], Attachment], deadline: Deadline, *, slots: int
+    ) -> SharedMemoryLane | None:
         """See ``SharedMemoryLane``; None also where the spaces have no fixed layout."""
         results = relay.declared
         space = results.manifest.single_observation_space
         observed = slabs.observation_layout(space, results.count, slots)
         layouts = action_layouts(results)
         if observed is None or layouts is None:
-            attachment.close()
             return None
-        lane = cls(relay, observed, layouts, attachment)
-        return lane if lane.agree(deadline) else None
+        return cls(relay, observed, layouts, attach()).agreed(deadline)
 
     def _attach_message(self, index: int) -> m.Attach:
         layout = self.observations.layout

@@ -7,7 +7,7 @@ from this one, and steps without messages.
 from __future__ import annotations
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from time import perf_counter_ns
 from typing import Any
 
@@ -90,7 +90,7 @@ class SharedMemoryLane(SlabLane):
 
     @classmethod
     def open(
-        cls, relay: Lane, attachment: Attachment, deadline: Deadline, *, slots: int
+        cls, relay: Lane, attach: Callable[[], Attachment], deadline: Deadline, *, slots: int
     ) -> SharedMemoryLane | None:
         """A lane with fresh slabs; None where they would be too large, or a runner refuses.
         ``slots``: how many batches there is room for; one is copied out, of several each is handed
@@ -101,21 +101,19 @@ class SharedMemoryLane(SlabLane):
         """
         layouts = message_layouts(relay.declared, slots)
         if layouts is None:
-            attachment.close()
             return None
         rings = [SlotRing(slots, size, slots * size) for _, size in layouts]
-        lane = cls(relay, [layout for layout, _ in layouts], rings, attachment)
-        return lane if lane.agree(deadline) else None
+        return cls(relay, [layout for layout, _ in layouts], rings, attach()).agreed(deadline)
 
-    def agree(self, deadline: Deadline) -> bool:
-        """Whether all runners attach the slabs; if one refuses, the lane is closed."""
+    def agreed(self, deadline: Deadline) -> SharedMemoryLane | None:
+        """The lane, if all runners attach the slabs; else it is closed."""
         agreed = False
         try:
             agreed = self._attach(range(len(self.shards)), deadline)
         finally:
             if not agreed:
                 self.close()
-        return agreed
+        return self if agreed else None
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
         """See ``Lane``; they get slabs that the dead never saw."""

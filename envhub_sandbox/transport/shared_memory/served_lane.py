@@ -57,8 +57,8 @@ class ServedLane(ColumnSteps):
         self._by_message = self._more_wanted = self._by_slabs = False
 
     @classmethod
-    def open(cls, relay: Lane, deadline: Deadline) -> Lane:
-        """The lane; ``relay`` itself where the spaces have no fixed layout, or one side refuses.
+    def open(cls, relay: Lane, deadline: Deadline) -> ServedLane | None:
+        """The lane; None where the spaces have no fixed layout, or one side refuses.
 
         Raises:
             WorkerError: A runner died, or took too long.
@@ -71,9 +71,9 @@ class ServedLane(ColumnSteps):
             if (observed := slabs.observation_layout(space, layout.count, 1)) is not None
         ]
         if len(shards) < len(results.slices):
-            return relay
+            return None
         lane = cls(relay, shards)
-        return lane if lane._attach(range(len(shards)), deadline) else relay
+        return lane if lane._attach(range(len(shards)), deadline) else None
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
         """See ``Lane``; they get slabs that the dead never saw."""
