@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,27 +101,16 @@ class History(Recorder):
         ]
 
     def of_part(self) -> Recorder:
-        """See ``Recorder``."""
-        return _PartHistory(self)
+        """See ``Recorder``. A fleet records each step itself, and any bundle has all workers'."""
+        part: Any = Recorder()
+        part.started, part.requested, part.write = self.started, self.requested, self.write
+        return cast("Recorder", part)
 
     def write(self, folder: Path, crash: Crash) -> Path | None:
         """See ``Recorder``."""
         from envhub_sandbox.extras.crash.bundle_writer import write_bundle
 
         return write_bundle(folder, crash, self.recording())
-
-
-class _PartHistory(Recorder):
-    """What one worker of a fleet adds to the history of the whole environment.
-
-    The fleet records each request once, for all workers; a crash bundle of any of them has the
-    whole.
-    """
-
-    def __init__(self, whole: History) -> None:
-        self.requested = whole.requested  # type: ignore[method-assign]  # for this worker alone
-        self.write = whole.write  # type: ignore[method-assign]
-        self.started = whole.started  # type: ignore[method-assign]
 
 
 def encoded(message: m.Message) -> list[bytes]:
