@@ -45,7 +45,7 @@ from envhub_sandbox.hub.secrets import is_home, looks_secret
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import extras
 from envhub_worker.protocol.records import dataclass
-from envhub_worker.protocol.text import counted
+from envhub_worker.protocol.text import counted, first_of
 
 _GIT = ".git"
 _EXAMPLES = "examples:"
@@ -355,8 +355,7 @@ class LocalFolder:
 
 
 def _shown(names: Collection[str]) -> str:
-    more = len(names) - _SHOWN
-    return ", ".join([*sorted(names)[:_SHOWN], *([f"{more} more"] if more > 0 else [])])
+    return ", ".join(first_of(sorted(names), _SHOWN))
 
 
 def _is_venv(folder: Path) -> bool:

@@ -52,6 +52,7 @@ from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import extras
 from envhub_sandbox.system.log import SNAPSHOT, tell
 from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.text import first_of
 
 __all__ = ["FileRecord", "Snapshot", "SnapshotLimits", "fetch", "local"]
 
@@ -405,6 +406,5 @@ def _missing_entry(path: str, files: tuple[FileRecord, ...]) -> tuple[str, str]:
     import difflib
 
     close = difflib.get_close_matches(path, names, n=1) or names
-    shown = ", ".join(repr(name) for name in names[:_SHOWN_FILES])
-    more = f" and {len(names) - _SHOWN_FILES} more" if len(names) > _SHOWN_FILES else ""
-    return lack, f"Name the entry file after a colon, as in ':{close[0]}'; it has {shown}{more}"
+    shown = ", ".join(first_of(list(map(repr, names)), _SHOWN_FILES))
+    return lack, f"Name the entry file after a colon, as in ':{close[0]}'; it has {shown}"

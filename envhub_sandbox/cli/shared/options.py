@@ -17,6 +17,7 @@ from envhub_sandbox.cli.shared.console import prints_on_stderr, safe_line
 from envhub_sandbox.cli.shared.exits import ForeignError, UsageError, reported
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.settings.options import OPTIONS, json_or_text
+from envhub_worker.protocol.text import first_of
 
 if TYPE_CHECKING:
     from envhub_sandbox.hub.snapshot import Snapshot
@@ -223,9 +224,9 @@ def select_envs(
         if (not suites or str(item[0]) in suites) and (not tasks or str(item[1]) in tasks)
     ]
     if not chosen:
-        names = ", ".join(safe_line(f"{suite}/{task}", 80) for suite, task, _ in every[:_NAMED])
-        more = f" and {len(every) - _NAMED} more" if len(every) > _NAMED else ""
-        raise UsageError(f"no such suite or task; there are (suite/task): {names}{more}")
+        names = [safe_line(f"{suite}/{task}", 80) for suite, task, _ in every]
+        shown = ", ".join(first_of(names, _NAMED))
+        raise UsageError(f"no such suite or task; there are (suite/task): {shown}")
     return chosen
 
 

@@ -14,7 +14,7 @@ from envhub_sandbox.errors import EnvHubError, RemoteEnvError, WorkerDiedError, 
 from envhub_sandbox.extras.judge.checks import CHECKS, CURES, Check, Severity
 from envhub_sandbox.play.confinement import Confinement
 from envhub_sandbox.play.plays import Play
-from envhub_worker.protocol.text import counted, duration_text, printable
+from envhub_worker.protocol.text import counted, duration_text, first_of, printable
 
 _RETURNED = re.compile(
     r"(?:reset|step) of sub-environment \d+ returned |\S{1,200} \([^()]{1,200}\) does not return "
@@ -162,8 +162,7 @@ class Report:
         made = {finding.id for finding in self.findings} | {check for check, _ in self.passed}
         self.unmade = [check for check in CHECKS if check not in made and check != "deadline"]
         left = [*self.unmade, *(f"all of {task}" for task in self.waiting)]
-        more = [f"and {len(left) - _SHOWN} more"] if len(left) > _SHOWN else []
-        shown = ", ".join([*left[:_SHOWN], *more])
+        shown = ", ".join(first_of(left, _SHOWN))
         text = f"ended after {duration_text(seconds)}, at: {at}. Not judged: {shown or 'its end'}"
         self.judged("deadline", [text])
 

@@ -13,7 +13,7 @@ from envhub_sandbox.hub.grammar import FILE, FOLDER, has_control_characters, loc
 from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import is_here
-from envhub_worker.protocol.text import printable, size_text
+from envhub_worker.protocol.text import first_of, printable, size_text
 
 MOST_BYTES = 1 << 20
 MOST = 2_000
@@ -53,8 +53,8 @@ def read_entries(file: IO[bytes], title: str) -> list[ListEntry]:
     entries: dict[str, ListEntry] = {}
     wrong = list(_read_into(entries, text))
     if wrong:
-        more = [f"and {len(wrong) - _SHOWN} more"] if len(wrong) > _SHOWN else []
-        lines = "\n".join([*(f"{title}:{line}: {what}" for line, what in wrong[:_SHOWN]), *more])
+        faults = [f"{title}:{line}: {fault}" for line, fault in wrong]
+        lines = "\n".join(first_of(faults, _SHOWN))
         raise HubReferenceError(f"nothing was run, because the list cannot be read:\n{lines}")
     if not entries:
         raise HubReferenceError(f"{title} has no reference; write one on each line")

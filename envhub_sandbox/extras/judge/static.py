@@ -32,7 +32,7 @@ from envhub_sandbox.extras.sources.parsing import MOST_BYTES, Import, ParsedFile
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.hub.local import IGNORED, REPOSITORY, LocalFolder
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_worker.protocol.text import counted, printable
+from envhub_worker.protocol.text import counted, first_of, printable
 
 _LONGEST = 500
 _MOST_BYTES_OF_TEXT = 1 << 20
@@ -202,8 +202,7 @@ def _left_out(here: LocalFolder) -> Iterator[Finding]:
         else:
             left.setdefault(item.why, []).append(item.path)
     for why, paths in left.items():
-        more = len(paths) - _SHOWN_IGNORED
-        shown = ", ".join([*paths[:_SHOWN_IGNORED], *([f"{more} more"] if more > 0 else [])])
+        shown = ", ".join(first_of(paths, _SHOWN_IGNORED))
         begin = "git leaves out" if why == IGNORED else f"left out, {why}:"
         yield Finding("source-ignored", f"{begin} {shown}")
 

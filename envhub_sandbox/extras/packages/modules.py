@@ -25,7 +25,7 @@ from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.folders import cache_root, keep, recall
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import mapped_modules
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import first_of, printable
 
 if TYPE_CHECKING:
     from envhub_sandbox.extras.packages.declared import DeclaredPackages, WantedPackage
@@ -335,8 +335,7 @@ class MissingModule:
 def _what(found: DeclaredPackages | None, snapshot: Snapshot) -> str:
     if found is not None and found.wanted:
         names = [str(wanted.requirement) for wanted in found.wanted]
-        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-        return f"Its {found.source} declares {', '.join(names[:_SHOWN])}{more}"
+        return f"Its {found.source} declares {', '.join(first_of(names, _SHOWN))}"
     from envhub_sandbox.extras.packages.declared import not_read
 
     seen = not_read(snapshot.root, snapshot.path)

@@ -42,7 +42,7 @@ from envhub_sandbox.hub.listing import (
 )
 from envhub_sandbox.system.log import SNAPSHOT
 from envhub_sandbox.system.platform import IS_LINUX, kill_group, own_group, own_variables
-from envhub_worker.protocol.text import printable, size_text
+from envhub_worker.protocol.text import first_of, printable, size_text
 
 if sys.platform != "win32":
     import resource
@@ -334,9 +334,8 @@ class GitHost:
         with fetched(f"{self.public_endpoint}/{repo.repo_id}", commit) as found:
             title = f"{repo.repo_id}@{commit[:12]}"
             if found.submodules:
-                shown, left = map(repr, found.submodules[:_SHOWN]), len(found.submodules) - _SHOWN
-                more = f" and {left} more" if left > 0 else ""
-                SNAPSHOT.warning("%s: submodules are left out: %s%s", title, ", ".join(shown), more)
+                shown = ", ".join(first_of(list(map(repr, found.submodules)), _SHOWN))
+                SNAPSHOT.warning("%s: submodules are left out: %s", title, shown)
             if _has_lfs(found):
                 SNAPSHOT.warning("%s: of its files in LFS only the pointers are here", title)
             records = (

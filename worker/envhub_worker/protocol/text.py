@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import re
 import sys
+from collections.abc import Sequence
 
 _KEPT = "\n\t"
 MARGIN = "  | "
@@ -30,6 +31,12 @@ def printable(text: str, limit: int = 16_384) -> str:
 def counted(count: int, noun: str, plural: str = "") -> str:
     """``"1 finding"`` or ``"2 findings"``."""
     return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
+
+
+def first_of(texts: Sequence[str], most: int) -> list[str]:
+    """The first texts, and ``"and 3 more"`` in place of the others."""
+    more = len(texts) - most
+    return [*texts[:most], *([f"and {more} more"] if more > 0 else [])]
 
 
 def size_text(count: float) -> str:

@@ -29,7 +29,7 @@ from envhub_sandbox.extras.packages.request import Choice, request_of
 from envhub_sandbox.extras.packages.resolution.resolutions import resolution_for
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_worker.protocol.spaces.spaces import encode_space
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import first_of, printable
 
 _SHOWN = 30
 _TEXT = 200
@@ -53,8 +53,7 @@ def refuse(found: Sequence[str], label: str) -> None:
     """Raise ``LockDriftError`` if anything has drifted."""
     if not found:
         return
-    more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
-    lines = "\n".join(f"  {line}" for line in [*found[:_SHOWN], *more])
+    lines = "\n".join(f"  {line}" for line in first_of(found, _SHOWN))
     raise LockDriftError(
         f"{label}: differs from its lock:\n{lines}\nUse what was locked, or lock the present "
         "state: envhub lock --upgrade REF",

@@ -78,7 +78,7 @@ def test_what_git_ignores_is_a_note(repository: GitRepository) -> None:
     [one] = found(repository.folder)
     assert (one.id, one.file) == ("source-ignored", "")
     assert one.message.startswith("git leaves out .venv/, 00.pyc, 01.pyc")
-    assert one.message.endswith("08.pyc, 3 more")
+    assert one.message.endswith("08.pyc, and 3 more")
 
 
 def cloned_as_it_is(repository: GitRepository, folder: Path, name: str, text: str) -> Path:
