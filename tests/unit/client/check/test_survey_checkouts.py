@@ -131,7 +131,7 @@ def test_patterns_that_cannot_be_read_are_an_error(
     """One can take git for ever, and what it says then is not known: which files it converts."""
     (repository.folder / ("a" * 200 + "1")).write_text("")
     (repository.folder / name).write_text(f"{'*a' * 60}b{rest}\n")
-    monkeypatch.setattr(checkout, "TIMEOUT_S", 5.0)
+    monkeypatch.setattr(checkout, "TIMEOUT_S", 1.0)
     with pytest.raises(SnapshotError, match=r"cannot read its \.gitattributes"):
         found(repository.folder)
 
