@@ -24,6 +24,7 @@ def test_steps_past_the_server_count(monkeypatch: pytest.MonkeyPatch) -> None:
 
     timer = IdleTimer(60.0)
     timer.watch(1, [os.dup(slab) for slab in slabs])
+    timer.watch(1, [os.memfd_create("of another environment there") for _ in slabs])
     for asked, answered, busy in ((0, 0, False), (1, 0, False), (1, 1, False), (1, 1, True)):
         count(asked, answered)
         now[0] += 59.0
