@@ -22,7 +22,7 @@ from tests.support.compare import assert_same
 
 FAMILY = "The client, from inside a jail"
 HOSTILE, COUNT, STEPS = 1, 3, 40
-PATIENCE_S = 6.0
+PATIENCE_S = 2.0
 _ENV = """
 import os, threading, time
 from envhub_worker.protocol import messages as m
