@@ -78,24 +78,6 @@ def state(env: Any) -> State:
     return session(env).lifecycle.state
 
 
-def choice_of_runtime() -> Spot:
-    return make_env, "Runtime"
-
-
-def choice_of_packages() -> Spot:
-    return source, "packages_for"
-
-
-def cut_s() -> Spot:
-    """For how long a server may end handshakes."""
-    return tcp, "_CUT_S"
-
-
-def first_keep_alive_s() -> Spot:
-    """After how long a server on another host first hears that its client lives."""
-    return remote, "_FIRST_S"
-
-
 def use_lock(env: Any) -> Spot:
     """What a thread holds while it asks the environment something."""
     return session(env).use, "lock"
@@ -252,11 +234,6 @@ def hold_server(env: Any, release: Callable[[], None]) -> None:
     session(env).lease._release_server = release
 
 
-def order(known: Launcher) -> Any:
-    """What is asked of a server of this machine for a jail of this repository."""
-    return known._order(1)
-
-
 def _running(env: Any) -> LoadedJail:
     found = loaded(env)
     assert found is not None, f"the environment has no jail: {state(env).name}"
@@ -325,6 +302,17 @@ CGROUP_WRITE: Spot = (cgroups, "_write")
 """What writes a file of a control group."""
 DECODING: Spot = (message, "_checked")
 """What makes a message of a decoded document that has no form yet."""
+CHOICE_OF_RUNTIME: Spot = (make_env, "Runtime")
+CHOICE_OF_PACKAGES: Spot = (source, "packages_for")
+CUT_S: Spot = (tcp, "_CUT_S")
+"""For how long a server may end handshakes."""
+FIRST_KEEP_ALIVE_S: Spot = (remote, "_FIRST_S")
+"""After how long a server on another host first hears that its client lives."""
+IMPORTS_IN_MEMORY: Spot = (modules, "_READ")
+"""What was read of repositories in this process."""
+FINDING_INTERPRETERS: Spot = (interpreters, "_others")
+TELLING_RELEASES_APART: Spot = (resolutions, "_stamp")
+"""Says which release lies at an interpreter's path."""
 MAY_SPIN: Spot = (served_slabs, "_MAY_SPIN")
 """Whether a server and a runner wait awake for one another on this machine."""
 FORMS: Spot = message, "_INCOMING"
@@ -434,17 +422,3 @@ def door_is_shut(doorman: ConnectionLimiter) -> bool:
 def making_an_environment(step: str) -> Spot:
     """A step of it: ``install``, ``size``, ``compile``, ``close`` or ``publish``."""
     return environments, f"_{step}"
-
-
-def imports_in_memory() -> Spot:
-    """What was read of repositories in this process."""
-    return modules, "_READ"
-
-
-def finding_interpreters() -> Spot:
-    return interpreters, "_others"
-
-
-def telling_releases_apart() -> Spot:
-    """Says which release lies at an interpreter's path."""
-    return resolutions, "_stamp"

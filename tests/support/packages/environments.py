@@ -59,6 +59,6 @@ def installed_once(built: str | None = None) -> Iterator[Callable[[tuple[str, ..
 def running_on(runtime: Runtime) -> Iterator[None]:
     """While it lasts, ``make_env`` gives its jails this interpreter and these packages."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(*inside.choice_of_packages(), lambda *asked, **options: None)
-        patch.setattr(*inside.choice_of_runtime(), lambda python: runtime)
+        patch.setattr(*inside.CHOICE_OF_PACKAGES, lambda *asked, **options: None)
+        patch.setattr(*inside.CHOICE_OF_RUNTIME, lambda python: runtime)
         yield

@@ -93,7 +93,7 @@ def test_a_commit_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     found = snapshot(tmp_path / "r", "import chess" + MAKE)
     assert requirements(found) == ["chess"]
     monkeypatch.setattr(parsing, "read", lambda snapshot: pytest.fail("read again"))
-    monkeypatch.setattr(*inside.imports_in_memory(), {})
+    monkeypatch.setattr(*inside.IMPORTS_IN_MEMORY, {})
     assert requirements(found) == ["chess"]
 
 
@@ -299,7 +299,7 @@ def test_another_release_is_tried_and_remembered(
 ) -> None:
     """The newest first, after our own; the next time it is known which."""
     stamps = {"/opt/3.98.0": [1, 1]}
-    monkeypatch.setattr(*inside.telling_releases_apart(), lambda one: stamps.get(one.path, [0, 0]))
+    monkeypatch.setattr(*inside.TELLING_RELEASES_APART, lambda one: stamps.get(one.path, [0, 0]))
     found = resolutions.resolution_for(request("a"))
     assert found.interpreter.version == "3.98.0"
     assert tried == [OURS.path, "/opt/3.99.1", "/opt/3.98.0"]
@@ -334,7 +334,7 @@ def test_no_other_release_is_tried_in_vain(
 def test_uv_fetches_an_interpreter_only_where_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
     here: list[Interpreter] = []
-    monkeypatch.setattr(*inside.finding_interpreters(), lambda wanted: list(here))
+    monkeypatch.setattr(*inside.FINDING_INTERPRETERS, lambda wanted: list(here))
 
     def run(arguments: Any, **options: Any) -> str:
         asked.append((arguments[:2], arguments[-1], options["variables"]["UV_PYTHON_DOWNLOADS"]))

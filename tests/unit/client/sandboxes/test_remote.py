@@ -78,7 +78,7 @@ def test_the_thread_outlives_every_fault(moment: str, monkeypatch: pytest.Monkey
                 raise zmq.ZMQError(errno.ENOTSOCK)
 
     monkeypatch.setattr(remote, "WorkerConnection", Connection)
-    monkeypatch.setattr(*inside.first_keep_alive_s(), 0.01)
+    monkeypatch.setattr(*inside.FIRST_KEEP_ALIVE_S, 0.01)
     server = remote.RemoteServer("tcp://host:1", TcpServer(None, None))
     assert heard.wait(60)
     assert left == []
