@@ -8,12 +8,11 @@ caller may change what they were made of afterwards.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.recorder import Crash, Recorder
@@ -53,8 +52,9 @@ class History(Recorder):
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
-        # A step of plain actions is kept as the array: packing takes longer than many a step.
-        self._log: deque[NDArray[Any] | RecordedRequest] = deque()
+        # Of a step a copy of its actions, which is packed only after a death: that takes longer
+        # than many a step.
+        self._log: deque[Any] = deque()
         self.started()
 
     def started(self) -> None:
@@ -69,8 +69,7 @@ class History(Recorder):
 
     def step(self, actions: Any) -> None:
         """See ``Recorder``."""
-        plain = type(actions) is np.ndarray and not actions.dtype.hasobject
-        self._add(actions.copy() if plain else RecordedRequest(encoded(m.Step(0, actions))))
+        self._add(_copied(actions))
 
     def requested(self, request: Request) -> None:
         """See ``Recorder``. What a reset of all seeds does not depend on what was asked before it,
@@ -87,7 +86,7 @@ class History(Recorder):
         passes = isinstance(message, m.CallOne) and message.name in _PASSING
         self._add(RecordedRequest(_frames(request), isinstance(message, _LASTING) and not passes))
 
-    def _add(self, entry: NDArray[Any] | RecordedRequest) -> None:
+    def _add(self, entry: Any) -> None:
         self._log.append(entry)
         self._room -= _size(entry)
         while self._log and (self._room < 0 or len(self._log) > self._limit):
@@ -156,7 +155,23 @@ def _joined(slices: Sequence[Any]) -> Any:
     return type(slices[0])(item for part in slices for item in part) if is_sequence else slices[0]
 
 
-def _size(entry: NDArray[Any] | RecordedRequest) -> int:
+def _copied(actions: Any) -> Any:
+    """Actions that their owner cannot change any more: arrays copied, containers rebuilt."""
+    if type(actions) is np.ndarray:
+        return actions.copy()
+    if isinstance(actions, Mapping):
+        return {key: _copied(item) for key, item in actions.items()}
+    if isinstance(actions, (tuple, list)):
+        return [*map(_copied, actions)] if type(actions) is list else tuple(map(_copied, actions))
+    return actions
+
+
+def _size(entry: Any) -> int:
+    if type(entry) is np.ndarray:
+        return entry.nbytes + _ENTRY_BYTES
     if isinstance(entry, RecordedRequest):
         return _REQUEST_BYTES + sum(map(len, entry.frames))
-    return entry.nbytes + _ENTRY_BYTES
+    if isinstance(entry, (tuple, list, Mapping)):
+        values = entry.values() if isinstance(entry, Mapping) else entry
+        return _ENTRY_BYTES + sum(map(_size, values))
+    return _ENTRY_BYTES + (len(entry) if isinstance(entry, (str, bytes)) else 0)
