@@ -19,7 +19,9 @@ from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard, ObservationSlab, SlotRing
 from envhub_sandbox.transport.shared_memory.served_lane import ReceivedBatch, ServedShard
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.messages.forms import IrregularError
 from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.shared_memory.columns import StepColumns
 from envhub_worker.protocol.shared_memory.packets import packet_bytes, write_packet
 
 pytestmark = pytest.mark.short
@@ -324,6 +326,8 @@ def test_columns_of_a_step_are_numbers_and_texts_of_its_form(scalars: bytes, ref
     else:
         answer = shard.answer()
         attack(shard, f"os.pwrite(observations, bytes({SLOT}), 0)")
+        with pytest.raises(IrregularError):  # more costs more than it saves
+            StepColumns([[None] * 1024], SLOT)
         endless = struct.pack("QQ", slabs.COLUMNS, slabs.INFO_BYTES + 1)
         attack(shard, f"os.pwrite(reply, {endless!r}, {slabs.OUTCOME * 8})")
         with pytest.raises(RemoteProtocolError, match="impossible answer"):

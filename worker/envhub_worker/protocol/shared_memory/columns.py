@@ -25,7 +25,7 @@ from envhub_worker.protocol.errors import UNTRUSTED, RemoteProtocolError
 from envhub_worker.protocol.messages.forms import IrregularError
 from envhub_worker.protocol.shared_memory.words import INFO_BYTES, LINE
 
-_MAX_LEAVES = 1024
+_MAX_PARTS = 1024
 _PLAIN = frozenset({float, int, bool, str})
 New = tuple[list[Any], list[Any]]
 """Scalars and arrays of new results, in the order of the columns."""
@@ -52,7 +52,7 @@ class StepColumns:
     def __init__(self, values: Sequence[Any], room: int) -> None:
         self._scalars: list[type] = []
         self._arrays: list[tuple[tuple[int, ...], np.dtype[Any], int, str]] = []
-        self.nbytes, self._room = 0, room
+        self.nbytes, self._room, self._parts = 0, room, 0
         self._copies: tuple[Any, list[Callable[[], Any]]] = None, []
         self._views: dict[int, list[Any]] = {}
         try:
@@ -65,6 +65,9 @@ class StepColumns:
     # --- what they are -------------------------------------------------------------------------
 
     def _part(self, value: Any) -> tuple[_Take, _Make]:
+        self._parts += 1
+        if self._parts > _MAX_PARTS:
+            raise IrregularError
         kind = type(value)
         if kind in _PLAIN:
             return self._scalar(kind, kind, item=False)
@@ -98,7 +101,6 @@ class StepColumns:
         self._scalars.append(plain)
         if plain not in _PLAIN:  # complex
             raise IrregularError
-        self._refuse_too_many()
 
         def take(value: Any, new: New) -> None:
             if type(value) is not kind:
@@ -120,13 +122,10 @@ class StepColumns:
             raise IrregularError
         self._arrays.append((array.shape, array.dtype, self.nbytes, name))
         self.nbytes += -(-array.nbytes // LINE) * LINE
-        self._refuse_too_many()
+        if self.nbytes > self._room:
+            raise IrregularError
         take = partial(_take_tensor if name else _take_array, array.dtype, array.shape)
         return take, lambda scalars, found: next(found)
-
-    def _refuse_too_many(self) -> None:
-        if self.nbytes > self._room or len(self._scalars) + len(self._arrays) > _MAX_LEAVES:
-            raise IrregularError
 
     # --- out and in ----------------------------------------------------------------------------
 
