@@ -290,7 +290,7 @@ class ShardSlabs:
         self._form = columns
         self.answer_bytes += columns.nbytes + length
         packed = bytes(self._reply[slabs.INFOS : slabs.INFOS + length]) if length else b""
-        return columns.read(slots.memory, packed, to_tensor, borrows=slots.chosen != _SPARE)
+        return columns.read(*slots.whole, packed, to_tensor, slots.borrowed)
 
     def checked_step(self) -> list[Any] | None:
         """The fields of the answer to a step, if it came as columns that ``note_checked`` was said
@@ -530,13 +530,18 @@ class SlotRing:
         self.chosen = _SPARE
 
     @property
-    def memory(self) -> Any:
-        """The memory of the chosen slot, which counts as held while there is a view of it."""
-        return self._slots[self.chosen]
+    def whole(self) -> tuple[Any, int]:
+        """The memory of all slots, views of which hold none, and where the chosen one begins."""
+        return self._memory, self.chosen * self.slot_bytes
+
+    @property
+    def borrowed(self) -> Any:
+        """The chosen slot, if the batch in it is handed out where it lies; else None."""
+        return None if self.chosen == _SPARE else self._slots[self.chosen]
 
     def bytes_of_chosen(self) -> memoryview:
-        """The same, as bytes."""
-        return memoryview(self.memory)[: self.slot_bytes]
+        """The memory of the chosen slot, which counts as held while there is a view of it."""
+        return memoryview(self._slots[self.chosen])[: self.slot_bytes]
 
     def close(self) -> None:
         """Give the descriptor back; the memory goes with the last array over it."""

@@ -53,7 +53,7 @@ class StepColumns:
         self._scalars: list[type] = []
         self._arrays: list[tuple[tuple[int, ...], np.dtype[Any], int, str]] = []
         self.nbytes, self._room, self._parts = 0, room, 0
-        self._copies: tuple[Any, list[Callable[[], Any]]] = None, []
+        self._copies: dict[int, list[Callable[[], Any]]] = {}
         self._views: dict[int, list[Any]] = {}
         try:
             self._fields = [self._part(value) for value in values]
@@ -148,17 +148,19 @@ class StepColumns:
         return packed
 
     def read(
-        self, memory: Any, packed: bytes, tensors: TensorMaker, *, borrows: bool = False
+        self, memory: Any, start: int, packed: bytes, tensors: TensorMaker, slot: Any = None
     ) -> list[Any]:
-        """The fields of the message; fresh, but for large arrays if it ``borrows``.
-        ``memory``: the slot. Trust: input from the worker.
+        """The fields of the message, out of the slot at ``start``. Trust: input from the worker.
+        ``slot``: a map of it, to which large arrays are to refer; else all are copies.
         """
-        if borrows:
-            found = [_borrowed(memory, *place) for place in self._arrays]
+        copies = self._copies.get(start)
+        if copies is None:
+            copies = self._copies[start] = [_copier(memory, start, *one) for one in self._arrays]
+        if slot is None:
+            found = [copy() for copy in copies]
         else:
-            if self._copies[0] is not memory:
-                self._copies = memory, [_copier(memory, *place) for place in self._arrays]
-            found = [copy() for copy in self._copies[1]]
+            pairs = zip(copies, self._arrays, strict=True)
+            found = [_borrowed(slot, *one) if _large(*one) else copy() for copy, one in pairs]
         for index, name in self._tensors:
             found[index] = tensors(found[index], name)
         scalars: Iterator[Any] = iter(())
@@ -207,15 +209,16 @@ def _tensor_type() -> Any:
     return getattr(sys.modules.get("torch"), "Tensor", None)
 
 
-def _copier(memory: Any, shape: Any, dtype: Any, at: int, _: str) -> Callable[[], Any]:
+def _copier(memory: Any, start: int, shape: Any, dtype: Any, at: int, _: str) -> Callable[[], Any]:
     if dtype.kind == "b":  # a hostile byte of 2 would make a boolean that is neither
-        return partial(np.ndarray(shape, np.uint8, memory, at).astype, np.bool_)
-    array: arrays.Array = np.ndarray(shape, dtype, memory, at)
+        return partial(np.ndarray(shape, np.uint8, memory, start + at).astype, np.bool_)
+    array: arrays.Array = np.ndarray(shape, dtype, memory, start + at)
     return array.copy
 
 
-def _borrowed(memory: Any, shape: Any, dtype: np.dtype[Any], at: int, name: str) -> Any:
-    large = dtype.kind != "b" and dtype.itemsize * math.prod(shape) > arrays.INLINE_BYTES
-    if large:
-        return np.ndarray(shape, dtype, memory, at)
-    return _copier(memory, shape, dtype, at, name)()
+def _large(shape: Any, dtype: Any, *_: Any) -> bool:
+    return bool(dtype.kind != "b" and dtype.itemsize * math.prod(shape) > arrays.INLINE_BYTES)
+
+
+def _borrowed(slot: Any, shape: Any, dtype: Any, at: int, _: str) -> Any:
+    return np.ndarray(shape, dtype, slot, at)
