@@ -84,10 +84,10 @@ class SingleEnv(gym.Env[Any, Any]):
 
     @property
     def sandbox(self) -> SandboxView:
-        """What confines it, and what that holds, was denied and has done.
+        """The layers around it, what it uses, what it was denied, and counters.
 
-        An attribute of this name that the environment has itself is ``env.vector.envs[0].sandbox``:
-        what it says there must not pass for what holds.
+        An attribute of this name of the environment's is ``env.vector.envs[0].sandbox``: its word
+        must not pass for these.
 
         Raises:
             AttributeError: There is no sandbox: it was made with ``sandbox=None``.
@@ -172,7 +172,7 @@ class SingleEnv(gym.Env[Any, Any]):
 
     @property
     def np_random(self) -> np.random.Generator:
-        """The environment's generator: a draw here advances it there, and the other way round."""
+        """The environment's generator, which a draw here advances, and the other way round."""
         if isinstance(self._vector, SandboxVectorEnv):
             return self._vector._generators.read()[0]
         generator = self._vector.np_random

@@ -72,7 +72,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         num_envs: Number of sub-environments.
         closed: Whether ``close`` has been called.
         metadata: With ``"autoreset_mode"``, as in Gymnasium.
-        sandbox: What confines it, and what that holds, was denied and has done.
+        sandbox: The layers around it, what it uses, what it was denied, and counters.
     """
 
     def __init__(self, session: AnySession, again: Callable[[], AnySession] | None = None) -> None:
@@ -127,10 +127,10 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     def prewarm(self) -> None:
         """Start its processes now, in the background; returns at once.
 
-        The first ``reset`` then waits only for what is left of that. Without it they start when
-        they are first needed, so that a suite of many tasks costs nothing before it is used: an
-        evaluation can prewarm the next task while it plays one. What fails is raised by the
-        first request.
+        The first ``reset`` then waits only for the rest of the start. Without it, processes start
+        when they are first needed, so that a suite of many tasks costs nothing before its use: an
+        evaluation can prewarm the next task while it plays one. The first request raises what
+        failed.
         """
         self._requests.refuse_if_closed()
         for prewarm in self._session.prewarms:
@@ -401,7 +401,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     @short_traceback
     def render(self) -> tuple[Any, ...] | None:
-        """What each sub-environment renders; None where the environment gives None."""
+        """What each sub-environment renders; None if the environment returns None."""
         replies = self._requests.ask("render", for_every_shard(m.Render))
         if self._manifest.shardable:
             rendered = self._requests.one_each("render", replies)
@@ -415,8 +415,8 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     def np_random(self) -> Any:
         """The generator of each sub-environment, or the one of a repository's own class.
 
-        What is drawn from one advances that of the environment, and the other way round. Those of
-        an ``AsyncVectorEnv`` are copies, as in Gymnasium.
+        A draw here advances the environment's generator, and the other way round. Those of an
+        ``AsyncVectorEnv`` are copies, as in Gymnasium.
         """
         generators = self._generators.read()
         if self._generators.single:
@@ -451,11 +451,11 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     @property
     def sandbox(self) -> SandboxView:
-        """What confines it, and what that holds, was denied and has done.
+        """The layers around it, what it uses, what it was denied, and counters.
 
-        Also where the repository's own vector environment has an attribute of this name, which
-        making it warns of: what it says there must not pass for what holds. Behind a wrapper it
-        is ``env.unwrapped.sandbox``; a sub-environment's own is ``env.envs[0].sandbox``.
+        Never an attribute of this name of the repository's, whose word must not pass for these;
+        ``make_env`` warns of one. Behind a wrapper it is ``env.unwrapped.sandbox``; a
+        sub-environment's own attribute is ``env.envs[0].sandbox``.
         """
         return SandboxView(self._session)
 
@@ -476,14 +476,14 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         self._requests.show_warnings()
 
     def close_extras(self, **kwargs: Any) -> None:
-        """There is nothing beyond ``close``."""
+        """Do nothing: ``close`` does all."""
 
     @short_traceback
     def __getattr__(self, name: str) -> Any:
         """An attribute that the repository's vector environment has beyond Gymnasium's."""
         manifest = self.__dict__.get("_manifest")
-        # Checked here once more, although the manifest was: where a property of ours raises
-        # AttributeError, Python calls this method with its name.
+        # The manifest's names were checked, but Python also calls this method with the name of a
+        # property of ours that raises AttributeError.
         ours = not is_servable(name) or hasattr(type(self), name)
         if manifest is None or ours or name not in manifest.attributes:
             raise absent(self, name, "get_attr")
