@@ -222,18 +222,18 @@ def _plan(sandbox: str | Sandbox, options: Options) -> _Plan:
     source = source_of(options)
     policy = policy_from(options.policy, options.limits)
     timeouts = timeouts_from(options.timeouts)
-    place = sandbox_of(sandbox)
-    if source.always and place.package_target() is None:
+    chosen = sandbox_of(sandbox)
+    if source.always and chosen.package_target() is None:
         raise PolicyError(
             f"packages by {option_name('dependencies')} are for this machine, for containers and "
             "for servers on other hosts; this place has packages of its own"
         )
     runtime = Runtime(interpreter(source.python))
-    place.note_interpreter(runtime)
-    if place.is_here:
+    chosen.note_interpreter(runtime)
+    if chosen.is_here:
         check_executable(runtime.python)
         check_readable(policy.readable)
-    return _Plan(place, policy, timeouts, source, runtime)
+    return _Plan(chosen, policy, timeouts, source, runtime)
 
 
 def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
@@ -283,32 +283,30 @@ def sandbox_of(sandbox: str | Sandbox | list[str | Sandbox]) -> Sandbox:
     has none of that kind.
     """
     fleet: Any = sandbox
+    result: Sandbox
     if isinstance(sandbox, (list, tuple)) or (isinstance(sandbox, str) and is_list(sandbox)):
         fleet = _extra("fleet.fleet", "Fleet")(sandbox)
-    place: Sandbox
     if callable(getattr(fleet, "opened", None)):
-        place = fleet.opened(sandbox_of)
-        return place
-    if isinstance(sandbox, str) and sandbox.startswith("tcp://"):
-        place = _extra("remote.sandbox", "RemoteSandbox")(sandbox)
-        return place
-    if not isinstance(sandbox, str):
+        result = fleet.opened(sandbox_of)
+    elif not isinstance(sandbox, str):
         if isinstance(sandbox, list) or not callable(getattr(sandbox, "for_repository", None)):
             raise _unknown(sandbox)
-        return sandbox
-    kind, _, image = sandbox.partition(":")
-    if sandbox == "process":
+        result = sandbox
+    elif sandbox.startswith("tcp://"):
+        result = _extra("remote.sandbox", "RemoteSandbox")(sandbox)
+    elif sandbox == "process":
         from envhub_sandbox.sandboxes.process import PROCESS, check_platform
 
         check_platform()  # before anything is downloaded for it
-        return PROCESS
-    if sandbox == "ray":
-        place = _extra("ray.sandbox", "RAY")
-    elif kind == "docker":
-        place = _extra("docker.sandbox", "DockerSandbox")(**{"image": image} if image else {})
+        result = PROCESS
+    elif sandbox == "ray":
+        result = _extra("ray.sandbox", "RAY")
+    elif sandbox.partition(":")[0] == "docker":
+        image = sandbox.partition(":")[2]
+        result = _extra("docker.sandbox", "DockerSandbox")(**{"image": image} if image else {})
     else:
         raise _unknown(sandbox)
-    return place
+    return result
 
 
 def _extra(module: str, name: str) -> Any:

@@ -41,11 +41,11 @@ class SeedError(TypeError, Error):
 
 
 @singledispatch
-def batch_of(space: gym.Space[Any], value: Any, count: int | None, where: str = "actions") -> Any:
+def batch_of(space: gym.Space[Any], value: Any, count: int | None, name: str = "actions") -> Any:
     """A batch of ``count`` members of a *single* action space; of a batched one for None.
 
     Returns arrays of shape ``(count, *space.shape)``, in dicts and tuples as the space has them, or
-    lists of Python's numbers in place of arrays. ``where`` is the batch's name in errors.
+    lists of Python's numbers in place of arrays. ``name`` is the batch's name in errors.
     Raises ``ActionError``: a wrong shape, dtype or structure.
     """
     if count is None:
@@ -54,10 +54,10 @@ def batch_of(space: gym.Space[Any], value: Any, count: int | None, where: str = 
         members = tuple(value)
     except TypeError:
         raise UniterableError(
-            f"{where}: expected {count} members of {space}, got {_named(value)}"
+            f"{name}: expected {count} members of {space}, got {_named(value)}"
         ) from None
     if len(members) != count:
-        raise ActionError(f"{where}: expected {count} members of {space}, got {len(members)}")
+        raise ActionError(f"{name}: expected {count} members of {space}, got {len(members)}")
     return members
 
 
@@ -66,9 +66,9 @@ def batch_of(space: gym.Space[Any], value: Any, count: int | None, where: str = 
 @batch_of.register(spaces.MultiDiscrete)
 @batch_of.register(spaces.MultiBinary)
 def _batch_of_arrays(
-    space: gym.Space[Any], value: Any, count: int | None, where: str = "actions"
+    space: gym.Space[Any], value: Any, count: int | None, name: str = "actions"
 ) -> Any:
-    array = value if type(value) is np.ndarray else _array(space, value, where)
+    array = value if type(value) is np.ndarray else _array(space, value, name)
     shape = _shape(space, count)
     dtype = np.dtype(space.dtype)
     # an empty list has numbers of no kind
@@ -77,7 +77,7 @@ def _batch_of_arrays(
         of = "all" if count is None else count
         places = f"{of} sub-environment{'' if count == 1 else 's'}"
         raise kind(
-            f"{where}: expected {dtype} of shape {shape} for {space} in {places}, "
+            f"{name}: expected {dtype} of shape {shape} for {space} in {places}, "
             f"got {array.dtype} of shape {array.shape}"
         )
     # an environment in this process would see the caller's own numbers
@@ -86,32 +86,32 @@ def _batch_of_arrays(
 
 @batch_of.register(spaces.Dict)
 def _batch_of_dicts(
-    space: spaces.Dict, value: Any, count: int | None, where: str = "actions"
+    space: spaces.Dict, value: Any, count: int | None, name: str = "actions"
 ) -> Any:
     if not isinstance(value, Mapping):
-        raise ActionTypeError(f"{where}: expected a mapping for {space}, got {_named(value)}")
+        raise ActionTypeError(f"{name}: expected a mapping for {space}, got {_named(value)}")
     missing = [key for key in space.spaces if key not in value]
     if missing:
-        raise ActionError(f"{where}: {missing} missing; the space is {space}")
+        raise ActionError(f"{name}: {missing} missing; the space is {space}")
     return {
-        key: batch_of(sub, value[key], count, f"{where}[{key!r}]")
+        key: batch_of(sub, value[key], count, f"{name}[{key!r}]")
         for key, sub in space.spaces.items()
     }
 
 
 @batch_of.register(spaces.Tuple)
 def _batch_of_tuples(
-    space: spaces.Tuple[Any], value: Any, count: int | None, where: str = "actions"
+    space: spaces.Tuple[Any], value: Any, count: int | None, name: str = "actions"
 ) -> Any:
     sequence = isinstance(value, (tuple, list))
     if not sequence or len(value) != len(space.spaces):
         kind = ActionError if sequence else ActionTypeError
         raise kind(
-            f"{where}: expected a tuple of {len(space.spaces)} batches for {space}, "
+            f"{name}: expected a tuple of {len(space.spaces)} batches for {space}, "
             f"got {_named(value)}"
         )
     return tuple(
-        batch_of(sub, item, count, f"{where}[{index}]")
+        batch_of(sub, item, count, f"{name}[{index}]")
         for index, (sub, item) in enumerate(zip(space.spaces, value, strict=True))
     )
 
