@@ -132,6 +132,7 @@ def test_an_action_that_cannot_be_sent_is_sent_to_nobody(tmp_path: Path) -> None
 
 
 def test_messages_of_no_layout_pack_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For its worker; a history of requests, which is off here, packs what it keeps."""
     folder = write_repository(tmp_path / "texts", _TEXTS)
     packed, pack = [], m.pack
 
@@ -139,7 +140,8 @@ def test_messages_of_no_layout_pack_once(tmp_path: Path, monkeypatch: pytest.Mon
         packed.append(type(message))
         return pack(message, **options)
 
-    with started(folder, n_envs=2, sandbox=["process", "process"]) as env:
+    options: Any = {"sandbox": ["process", "process"], "policy": {"crash_history": 0}}
+    with started(folder, n_envs=2, **options) as env:
         monkeypatch.setattr(m, "pack", noting)
         assert env.step((("a",), ("b",)))[0].tolist() == [1, 1]
         assert env.step((("c",), ("d",)))[0].tolist() == [2, 2]
