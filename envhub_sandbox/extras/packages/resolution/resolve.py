@@ -217,9 +217,16 @@ def sources_of(
 
 def uploaded(wanted: WantedPackage, python: str) -> str:
     """The day of the release that is chosen, as the index says it; empty if it does not."""
-    words = [*uv.NO_BUILDS, "--no-deps", "--format", "pylock.toml"]
-    request = PackageRequest("", (wanted,), runs_worker=False)
-    text = _compiled(request, Target(python=python), words, lambda line: None)
+    request, words = PackageRequest("", (wanted,), runs_worker=False), ("--format", "pylock.toml")
+    ask = partial(_compiled, request, Target(python=python), tell=lambda line: None)
+    try:
+        text = ask([*uv.NO_BUILDS, "--no-deps", *words])
+    except DependencyError as error:
+        names = without_wheels(error)
+        if not names:
+            raise
+        sources = ["--config-file", "uv.toml", "--no-deps", *words]
+        text = ask(sources, settings=_may_be_built(names))
     days = re.findall(r"upload-time = [^\d]{0,40}(\d{4}-\d{2}-\d{2})", text)
     return max(days, default="")
 
