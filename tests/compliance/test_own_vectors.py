@@ -391,9 +391,11 @@ class Batch(gym.vector.VectorEnv):
             "joints": gym.spaces.Box(-9, 9, (wide,)),
         })
         self.single_observation_space = seen
-        self.single_action_space = gym.spaces.Box(-1, 1, (2,))
         self.observation_space = gym.vector.utils.batch_space(seen, n)
-        self.action_space = gym.vector.utils.batch_space(self.single_action_space, n)
+        single = gym.spaces.Box(-1, 1, (2,))
+        batch = gym.vector.utils.batch_space(single, n)
+        spaces = (gym.Space(), gym.Space()) if mode == "Disabled" else (single, batch)
+        self.single_action_space, self.action_space = spaces  # one takes whatever it is given
         self.count, self.wide = 0, wide
 
     def seen(self):
@@ -442,9 +444,11 @@ def make_env(n_envs=1, use_async_envs=False, mode="NextStep", wide=3, tasks=1):
 def _played(envs: list[Any]) -> list[Any]:
     """What they return and raise in turns, and again once all of it has come."""
     heard: list[Any] = [env.reset(seed=seed) for seed, env in enumerate(envs)]
+    actions = np.zeros((2, 2), ">f4")
     for number, env in itertools.product(range(80), envs):
+        actions[:] = number // 3
         try:
-            heard.append(env.step(np.full((2, 2), number, np.float32)))
+            heard.append(env.step(actions))
         except (RemoteEnvError, RemoteProtocolError) as error:
             heard.append(f"{type(error).__mro__[1].__name__}: {error}".partition("\n")[0])
         if number % 10 == 0:

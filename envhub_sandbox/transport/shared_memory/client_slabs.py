@@ -190,10 +190,9 @@ class ShardSlabs:
         frames, self._told_frames = self._told_frames, []
         if type(actions) is not np.ndarray or actions.dtype.kind not in "biufc":
             return
-        start = self.layout.message + array_start(frames, actions.nbytes)
-        array: Any = np.ndarray(actions.shape, actions.dtype, self._request, start)
-        if array.tobytes() == actions.tobytes():  # not so of another byte order
-            self._actions = array
+        if actions.dtype.isnative:  # the message has them in native byte order
+            start = self.layout.message + array_start(frames, actions.nbytes)
+            self._actions = np.ndarray(actions.shape, actions.dtype, self._request, start)
 
     def write_actions(self, actions: Any, wishes: Wishes, slots: SlotRing) -> bool:
         """Write a step into the message that lies there, if that is one with such actions."""
