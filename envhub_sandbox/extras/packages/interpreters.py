@@ -148,11 +148,15 @@ def _others(wanted: SpecifierSet) -> list[Interpreter]:
     root = os.environ.get("PYENV_ROOT") or os.path.expanduser("~/.pyenv")
     # which may be another user's; this glob finds nothing where it may not look
     paths = glob.glob(f"{glob.escape(root)}/versions/3.*/bin/python3")
+    # its shims are no interpreters, but uv would start every one, each time
+    searched = os.environ.get("PATH", os.defpath).split(os.pathsep)
+    search = os.pathsep.join(path for path in searched if os.path.basename(path) != "shims")
     try:
         answer = uv.run(
             ["python", "list", "--no-config", "--only-installed", "--output-format", "json"],
             what="no interpreter was found",
             timeout_s=_FIND_S,
+            variables={"PATH": search},
         )
         paths += [str(row["path"]) for row in json.loads(answer) if _may_be(row)]
     except (DependencyError, ValueError, LookupError, TypeError):
@@ -171,9 +175,8 @@ def _answering(paths: Iterable[str]) -> Iterator[Interpreter]:
 
 
 def _may_be(row: dict[str, object]) -> bool:
-    """Whether it is worth asking: pyenv's shims are no interpreters, and 3.14t is another ABI."""
-    default = row.get("variant", "default") == "default"
-    return default and row.get("implementation") == "cpython" and "/shims/" not in str(row["path"])
+    """Whether it is worth asking: 3.14t is another ABI."""
+    return (row.get("variant", "default"), row.get("implementation")) == ("default", "cpython")
 
 
 class InstalledPackage(NamedTuple):
