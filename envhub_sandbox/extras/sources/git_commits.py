@@ -55,6 +55,8 @@ _MAX_ROW_BYTES = 2048
 """Of a file in git's listing: its names have no limit there, and each repeats those above it."""
 TIMEOUT_S = 900.0
 """For all that git does for one commit."""
+DAY_S = 30.0
+"""For the day of a commit, which is asked for while an error waits to be shown."""
 _BLOCK = 1 << 20
 _SAID_BYTES = 1000
 _ROW = re.compile(rb"(\d{6}) (\w+) ([0-9a-f]{40}) +(\d+|-)\t(.+)", re.DOTALL)
@@ -181,7 +183,7 @@ def fetched(url: str, commit: str, variables: Variables | None = None) -> Iterat
 def day_of(url: str, commit: str) -> str:
     """The day of a full commit, as its author has it: ``"2024-05-31"``. Raises as ``resolve``."""
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as folder:
-        git = _Git(Path(folder), None)
+        git = _Git(Path(folder), None, DAY_S)
         git.fetch(_checked(url), commit, "--filter=tree:0")  # without files, where a host can
         return git.run("log", "-1", "--no-patch", "--format=%cs", commit).decode().strip()
 
@@ -226,9 +228,12 @@ def _checked(url: str) -> str:
 class _Git:
     """Git in one folder, within one deadline, with nothing of the user's settings and logins."""
 
-    def __init__(self, store: Path, variables: Variables | None) -> None:
+    def __init__(
+        self, store: Path, variables: Variables | None, timeout_s: float | None = None
+    ) -> None:
         self._store = store
-        self._until = time.monotonic() + TIMEOUT_S
+        self._timeout_s = TIMEOUT_S if timeout_s is None else timeout_s
+        self._until = time.monotonic() + self._timeout_s
         ours = {"GIT_CONFIG_NOSYSTEM": "1", "GIT_CONFIG_GLOBAL": os.devnull, "HOME": str(store)}
         theirs = os.environ if variables is None else variables
         self._environment = {**_to_the_network(theirs), **ours, **_ALONE}
@@ -259,7 +264,7 @@ class _Git:
                 )
             except (OSError, subprocess.SubprocessError) as error:
                 late = isinstance(error, subprocess.TimeoutExpired)
-                why = f"it took longer than {TIMEOUT_S:.0f} s" if late else str(error)
+                why = f"it took longer than {self._timeout_s:.0f} s" if late else str(error)
                 said.seek(max(0, said.seek(0, os.SEEK_END) - _SAID_BYTES))
                 text = said.read(_SAID_BYTES).decode("utf-8", "replace") or why
                 what = f"git {arguments[0]} failed: {printable(text, _SAID_BYTES).strip()}"

@@ -331,7 +331,9 @@ def test_a_server_that_never_ends_keeps_no_process(
             subprocess.run(["git", "ls-remote", url], capture_output=False, timeout=3, check=True)
         assert not gone.wait(1), "the control failed"
     monkeypatch.setattr(commits, "TIMEOUT_S", 10.0)
-    with dripping() as (url, gone):
-        with pytest.raises(HubFailure, match="took longer than 10 s"):
-            commits.resolve(url, "main")
-        assert gone.wait(60)
+    monkeypatch.setattr(commits, "DAY_S", 9.0)  # an error waits for it
+    for ask, name, late_s in ((commits.resolve, "main", 10), (commits.day_of, "a" * 40, 9)):
+        with dripping() as (url, gone):
+            with pytest.raises(HubFailure, match=f"took longer than {late_s} s"):
+                ask(url, name)
+            assert gone.wait(60)

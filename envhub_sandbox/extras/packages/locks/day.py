@@ -10,6 +10,7 @@ import os
 import re
 from dataclasses import replace
 from datetime import date, datetime, timedelta, timezone
+from functools import lru_cache
 from pathlib import Path
 
 from envhub_sandbox.errors import (
@@ -139,6 +140,7 @@ def _of_files(snapshot: Snapshot) -> str:
     return datetime.fromtimestamp(newest, timezone.utc).strftime("%Y-%m-%d")
 
 
+@lru_cache(maxsize=8)
 def _of_release(snapshot: Snapshot) -> str:
     from envhub_sandbox.extras.packages import interpreters
     from envhub_sandbox.extras.packages.declared import declared
@@ -149,6 +151,7 @@ def _of_release(snapshot: Snapshot) -> str:
     return resolve.uploaded(says.wanted[0], interpreters.own().path)
 
 
+@lru_cache(maxsize=8)
 def _of_commit(snapshot: Snapshot) -> str:
     from envhub_sandbox.extras.sources import git_commits
     from envhub_sandbox.hub.client import HubClient
