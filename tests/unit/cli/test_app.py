@@ -1,7 +1,5 @@
 """What all commands have in common: their help, what a shell completes, and safe output."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re

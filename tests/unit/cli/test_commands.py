@@ -1,7 +1,5 @@
 """Each command by itself: what it does without a jail, and what it refuses before it opens one."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os

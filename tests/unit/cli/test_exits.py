@@ -1,7 +1,5 @@
 """Errors become one message and a documented exit code; strangers' text does no harm."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """Memory that may still be taken, in folders as the kernel shows them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

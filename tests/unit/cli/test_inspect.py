@@ -1,7 +1,5 @@
 """``envhub inspect --static`` and ``envhub diff``: read and compared, and nothing runs."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

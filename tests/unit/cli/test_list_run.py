@@ -1,7 +1,5 @@
 """``envhub check --all``: what is asked for is checked before anything is run."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """Options become arguments of ``make_env``, or a message that says what to write."""
 
-from __future__ import annotations
-
 import inspect
 from typing import Any
 

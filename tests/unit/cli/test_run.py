@@ -1,7 +1,5 @@
 """What ``envhub run`` does with the environments that it is given; nothing here is sandboxed."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Environments out of a first jail, or of what is remembered of it; held against each jail."""
 
-from __future__ import annotations
-
 import os
 import zipfile
 from collections.abc import Callable, Iterator

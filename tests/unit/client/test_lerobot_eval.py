@@ -1,7 +1,5 @@
 """Whose options those of ``lerobot-eval-sandboxed`` are."""
 
-from __future__ import annotations
-
 import sys
 from importlib.util import find_spec
 

@@ -1,7 +1,5 @@
 """What ``make_env`` was given is checked before anything is fetched or started."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import inspect

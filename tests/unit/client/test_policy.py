@@ -1,7 +1,5 @@
 """Policies, limits and timeouts: what is unknown or impossible is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections import UserList

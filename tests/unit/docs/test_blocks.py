@@ -1,7 +1,5 @@
 """Every block of code in the documents is executed, or held against what it talks about."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import importlib.util

@@ -1,7 +1,5 @@
 """What others' CI runs of us: the very lines of the action, the job and the hooks are run here."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -1,7 +1,5 @@
 """What operators are given beside the program: a unit of systemd and a dashboard of Grafana."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

@@ -3,8 +3,6 @@
 ``python -m tests.distributions`` builds, checks and installs both; this is what needs no network.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -4,8 +4,6 @@ The core is what a newcomer reads: processes as the sandbox, the Hub and folders
 Gymnasium's interface, the confinement. Each extra is a feature that the core could do without.
 """
 
-from __future__ import annotations
-
 from tests.unit.docs.test_imports import below, imported, modules
 
 # The last is one whose place is its name: users import other libraries' interfaces from there.

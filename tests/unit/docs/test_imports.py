@@ -1,7 +1,5 @@
 """Who may import whom: the arrows of docs/architecture.md, read off the source itself."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import subprocess

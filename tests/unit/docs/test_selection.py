@@ -1,7 +1,5 @@
 """What a run takes of the tests: ``--one-case`` loses no test function, and a full run no case."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Names of values in the core say what a value is; the vague ones that are left only get fewer."""
 
-from __future__ import annotations
-
 import ast
 from collections import Counter
 from itertools import chain

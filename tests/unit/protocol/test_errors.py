@@ -1,7 +1,5 @@
 """What the handling of a peer's input raises is the peer's fault; nothing else is."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

@@ -1,7 +1,5 @@
 """The table of an environment's life: what is legal, and what is not."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st

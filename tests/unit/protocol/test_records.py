@@ -1,7 +1,5 @@
 """Records are what the standard library makes of the same fields, but for how they are made."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import inspect

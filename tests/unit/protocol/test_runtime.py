@@ -1,7 +1,5 @@
 """Repositories of a jail's cache of the Hub are read within bounds; a client may send anything."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

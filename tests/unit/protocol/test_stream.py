@@ -1,7 +1,5 @@
 """Packets on a stream: cut anywhere they arrive whole; lies about lengths cost nothing."""
 
-from __future__ import annotations
-
 import itertools
 import struct
 import tracemalloc

@@ -1,7 +1,5 @@
 """What may not be read is not called missing."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The server's loop looks before each wait, and sleeps for as long as that permits."""
 
-from __future__ import annotations
-
 import os
 
 from envhub_worker.loop import Loop

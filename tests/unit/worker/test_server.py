@@ -1,7 +1,5 @@
 """A mistake of the server's own ends nothing, and the operator reads of it."""
 
-from __future__ import annotations
-
 import errno
 import tempfile
 import threading

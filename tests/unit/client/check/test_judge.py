@@ -1,7 +1,5 @@
 """What a judgement says of the reference itself."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Whatever a stranger says is text on a page, and the page's policy forbids all else."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from xml.etree import ElementTree
 

@@ -1,7 +1,5 @@
 """The page of a judgement: nothing of a stranger's is markup in it."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import re

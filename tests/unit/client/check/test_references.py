@@ -1,7 +1,5 @@
 """Lists of references: what is wrong with one is told by its line."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

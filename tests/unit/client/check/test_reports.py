@@ -1,7 +1,5 @@
 """Reports of ``envhub check``: what a repository writes into them stays text in each form."""
 
-from __future__ import annotations
-
 import json
 from html import unescape
 from xml.etree import ElementTree

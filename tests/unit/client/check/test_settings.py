@@ -1,7 +1,5 @@
 """Files with settings of a judgement: a caller's policy, and his options."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What a repository's files show: nothing is run, and what cannot be read is said."""
 
-from __future__ import annotations
-
 import ast
 import codecs
 import importlib

@@ -1,7 +1,5 @@
 """Where a folder is not what its commit is, that is found, and fails."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import tempfile

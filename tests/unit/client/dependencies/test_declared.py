@@ -1,7 +1,5 @@
 """What a stranger's files declare is data: what could build or run code does not get through."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

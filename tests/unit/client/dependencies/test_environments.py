@@ -1,7 +1,5 @@
 """Environments: made once, complete or not there, read-only, and of use without any index."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import importlib.util

@@ -1,7 +1,5 @@
 """What a repository imports and does not declare is installed for it, where it is known what."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Where a repository's packages come from: what the caller says, and what this interpreter has."""
 
-from __future__ import annotations
-
 import datetime
 import json
 import os

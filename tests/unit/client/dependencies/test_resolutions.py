@@ -1,7 +1,5 @@
 """Where there is no wheel: what is chosen is handed to a builder, and its wheel counts then."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import tarfile

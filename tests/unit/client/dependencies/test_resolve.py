@@ -1,7 +1,5 @@
 """Requirements become pins with hashes: by uv, from the index that the user chose, wheels only."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

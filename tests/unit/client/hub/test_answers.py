@@ -1,7 +1,5 @@
 """What the Hub's answers and failures mean, and TOML of strangers, by themselves."""
 
-from __future__ import annotations
-
 import errno
 import itertools
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Limits and names: what a listing may ask of this machine's disk."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Local folders become snapshots, so that authors can try before they push."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket

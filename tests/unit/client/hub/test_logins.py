@@ -1,7 +1,5 @@
 """A login stands in no pickle, repr or error, whatever URL or object it came in."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import sys

@@ -1,7 +1,5 @@
 """Hub references: every form works or says what to write instead."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The store: complete or absent, read-only, and checked at every use."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import stat

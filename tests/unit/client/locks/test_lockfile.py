@@ -1,7 +1,5 @@
 """Lock files: written and read again, held against what is there, and never believed."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Places of a fleet by their names."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Which worker goes where: fewest of the fleet first, then most room; then the next place."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Servers that environments share: started once, kept for their time, and ended once."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """A server that is our child: it ends with what was started for it, however its start went."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

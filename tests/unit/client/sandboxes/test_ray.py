@@ -1,7 +1,5 @@
 """What is believed of an actor's answer, and of Ray's own words."""
 
-from __future__ import annotations
-
 import concurrent.futures
 import copy
 import json

@@ -1,7 +1,5 @@
 """A client of a server on another host says that it lives, whatever fails meanwhile."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import hashlib

@@ -1,7 +1,5 @@
 """Bundles are untrusted: what is broken is refused, what is asked for is told, nothing is run."""
 
-from __future__ import annotations
-
 import json
 import os
 import pickle

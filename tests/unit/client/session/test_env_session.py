@@ -1,7 +1,5 @@
 """An error says whose it is, and where that runs: once, in its first line."""
 
-from __future__ import annotations
-
 import contextlib
 from typing import Any
 from unittest.mock import MagicMock, Mock

@@ -1,7 +1,5 @@
 """What is added to an error: the author's own line, what a jail lacks, and what it was denied."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import sys

@@ -1,7 +1,5 @@
 """The error of a failed request, why a state takes none, and how often a worker is replaced."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

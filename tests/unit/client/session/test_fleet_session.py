@@ -1,7 +1,5 @@
 """One request to several workers: who was sent nothing, and who alone is asked."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

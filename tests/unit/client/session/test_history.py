@@ -1,7 +1,5 @@
 """The history of an environment: what is kept, in which order, and what gives way."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

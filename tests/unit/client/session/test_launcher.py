@@ -1,7 +1,5 @@
 """How a jail ends, once, whatever interrupts it; and what is taken of its server's words."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from types import SimpleNamespace

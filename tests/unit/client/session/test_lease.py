@@ -1,7 +1,5 @@
 """An environment's hold on a jail: whatever interrupts it, the jail is given back, once."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from types import SimpleNamespace

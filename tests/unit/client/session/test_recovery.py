@@ -1,7 +1,5 @@
 """What is made of deaths: who the server says has died, seeds for the fresh, rows of the dead."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The requests of one environment: their order, their errors, and what is shown beside them."""
 
-from __future__ import annotations
-
 import warnings
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What one worker owes: how much it may, what a failure leaves, and what an interrupt shows."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

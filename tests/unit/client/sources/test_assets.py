@@ -3,8 +3,6 @@
 A card is read as data, within bounds, and only in one form.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """In a git checkout the snapshot of a folder is what git would commit, and no program runs."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

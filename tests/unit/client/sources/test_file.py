@@ -1,7 +1,5 @@
 """A file that is named alone gives its code nothing of its folder that is not its own."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

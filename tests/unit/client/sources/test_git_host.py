@@ -1,7 +1,5 @@
 """A host of git, as a host of repositories: what is read of it is held against its names."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io

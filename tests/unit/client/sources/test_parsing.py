@@ -1,7 +1,5 @@
 """What ``envhub check`` reads: nothing is imported, and what it cannot read is no crash."""
 
-from __future__ import annotations
-
 import ast
 import os
 import subprocess

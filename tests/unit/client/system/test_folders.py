@@ -1,7 +1,5 @@
 """Our folders and files: their modes, that they are whole, and whom they are believed."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import stat

@@ -1,7 +1,5 @@
 """Locks: who holds one, for how long, and that a fork does not."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

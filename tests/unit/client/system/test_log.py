@@ -1,7 +1,5 @@
 """Progress is a line where somebody looks, and a record in any case."""
 
-from __future__ import annotations
-
 import io
 import logging
 import sys

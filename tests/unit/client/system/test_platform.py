@@ -3,8 +3,6 @@
 ``tests/attacks/files/test_names.py`` has what the names are for.
 """
 
-from __future__ import annotations
-
 import configparser
 import json
 import os

@@ -1,7 +1,5 @@
 """A process that ends with the one that started it, and knows its forks."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """Replies are taken as they arrive; how a worker server has ended is told, with what to do."""
 
-from __future__ import annotations
-
 import os
 import select
 import subprocess

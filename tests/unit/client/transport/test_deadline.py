@@ -3,8 +3,6 @@
 Which shard runs on which core.
 """
 
-from __future__ import annotations
-
 import math
 import os
 

@@ -1,7 +1,5 @@
 """Watched attributes are known until they change; what has arrived stays until it is taken."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

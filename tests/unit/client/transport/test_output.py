@@ -1,7 +1,5 @@
 """A worker's output: lines of any bytes, bounded, fit for a terminal."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a worker says went wrong becomes an error of ours, whatever the text is."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import re

@@ -1,7 +1,5 @@
 """Over how many processes sub-environments are spread: what was tried, and what was fastest."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from functools import partial

@@ -1,7 +1,5 @@
 """A server on another host that ends handshakes: one that restarts, or one with another key."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading

@@ -1,7 +1,5 @@
 """Spaces, specs and generators in answers: the same on the other side, out of one budget."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 import sys

@@ -1,7 +1,5 @@
 """Actions: what the space could mean is taken as it is, everything else is refused here."""
 
-from __future__ import annotations
-
 import types
 from typing import Any
 

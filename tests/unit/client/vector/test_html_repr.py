@@ -1,7 +1,5 @@
 """What a notebook shows is escaped and bounded, whatever names a worker gives."""
 
-from __future__ import annotations
-
 import base64
 import re
 from html.parser import HTMLParser

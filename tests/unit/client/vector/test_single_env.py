@@ -1,7 +1,5 @@
 """A vector environment of one as a ``gymnasium.Env``: the same episodes as without it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """What ``make_env`` returns, with vector environments of this process in it."""
 
-from __future__ import annotations
-
 import threading
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Our own frames are left out of tracebacks that say without them where it comes from."""
 
-from __future__ import annotations
-
 import errno
 import logging
 import traceback

@@ -1,7 +1,5 @@
 """Ctrl-C between any two statements: the next request is not held up, nor sent as another."""
 
-from __future__ import annotations
-
 import copy
 import pickle
 from collections.abc import Callable

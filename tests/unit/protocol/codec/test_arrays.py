@@ -1,7 +1,5 @@
 """Arrays beside the header: every layout arrives as it was, and no lie about one is believed."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Values there and back with their types; hostile bytes nowhere."""
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import enum

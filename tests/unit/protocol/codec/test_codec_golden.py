@@ -1,7 +1,5 @@
 """The bytes of every kind of value, kept: other versions must read them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Malformed and oversized messages are refused, and the error says that the peer is to blame."""
 
-from __future__ import annotations
-
 import pickle
 import struct
 from functools import partial

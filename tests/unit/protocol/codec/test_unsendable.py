@@ -3,8 +3,6 @@
 What cannot be sent of a reply arrives as a description, and the rest as it is.
 """
 
-from __future__ import annotations
-
 import functools
 import threading
 import types

@@ -1,7 +1,5 @@
 """Manifests: what a repository returned arrives as it was; lies about it do not."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Which names of a worker become attributes, which facts it tells, and in which forms."""
 
-from __future__ import annotations
-
 import builtins
 import copy
 import pickle

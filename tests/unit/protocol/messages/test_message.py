@@ -3,8 +3,6 @@
 Messages that recur are unpacked by their form: nobody may notice.
 """
 
-from __future__ import annotations
-
 import sys
 import tracemalloc
 from typing import Any

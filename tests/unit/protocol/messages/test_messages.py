@@ -1,7 +1,5 @@
 """Messages: their bytes are kept, and only messages come out of bytes."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Warnings and changes in front of a reply: found, bounded, and nothing else."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -3,8 +3,6 @@
 ``tests/attacks/protocol/test_slabs.py`` has the memory beside them.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import socket

@@ -1,7 +1,5 @@
 """Where everything lies in the fast lane's memory."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Batches cut for shards and joined again: Gymnasium's own functions are the reference."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Infos of workers that are ready at different times: none changes what another has said."""
 
-from __future__ import annotations
-
 import itertools
 import warnings
 from typing import Any

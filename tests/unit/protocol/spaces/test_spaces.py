@@ -1,7 +1,5 @@
 """Spaces cross with every attribute; lies about them build nothing."""
 
-from __future__ import annotations
-
 import copy
 import tracemalloc
 import warnings

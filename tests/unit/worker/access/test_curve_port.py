@@ -1,7 +1,5 @@
 """Which connections a server knows to be there, and how it stops to look."""
 
-from __future__ import annotations
-
 import multiprocessing
 import socket
 from collections.abc import Iterator

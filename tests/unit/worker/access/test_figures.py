@@ -1,7 +1,5 @@
 """A server's figures: what clients and their jails use, and that clients make no labels of them."""
 
-from __future__ import annotations
-
 import subprocess
 
 import pytest

@@ -1,7 +1,5 @@
 """Keys as text, and the list of clients: whose may come in, and what of one that is broken."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The lines of a server's log: bounded in number and length, and never two for one event."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -1,7 +1,5 @@
 """What clients ask a server for: paths, listings and orders are taken within bounds."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Sessions, and places on a server: who holds what, who waits, whose place ends, and a drain."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import count, repeat
 from types import SimpleNamespace

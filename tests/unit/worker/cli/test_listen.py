@@ -1,7 +1,5 @@
 """What ``envhub-worker listen`` takes: sizes, addresses, and profiles; and what it prints."""
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import resource

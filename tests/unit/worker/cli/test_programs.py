@@ -1,7 +1,5 @@
 """The commands of ``envhub-worker``: their options, what they write, and what they refuse."""
 
-from __future__ import annotations
-
 import argparse
 import stat
 from pathlib import Path

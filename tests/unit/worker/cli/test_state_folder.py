@@ -1,7 +1,5 @@
 """What a server writes down for the commands of its machine, and who is believed."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Which GPUs a host has, and what of them a jail is given, over hosts that are made up."""
 
-from __future__ import annotations
-
 import posixpath
 
 import pytest

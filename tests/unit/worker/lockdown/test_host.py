@@ -1,7 +1,5 @@
 """What a host has to confine with: its facts, its users, and what a jail sees of it."""
 
-from __future__ import annotations
-
 import json
 import os
 import pwd

@@ -1,7 +1,5 @@
 """From policy and host to layers, by exact output."""
 
-from __future__ import annotations
-
 import resource
 from dataclasses import replace
 from types import SimpleNamespace

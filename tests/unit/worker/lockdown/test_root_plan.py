@@ -1,7 +1,5 @@
 """What of the host's files a jail sees, over a host that is made up."""
 
-from __future__ import annotations
-
 import pytest
 
 from envhub_worker.lockdown.root_plan import HostFiles, RootPlan, outermost, plan_root

@@ -1,7 +1,5 @@
 """What a runner tries before a stranger's code: where nothing confines, all of it goes through."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

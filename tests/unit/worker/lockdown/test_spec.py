@@ -1,7 +1,5 @@
 """What a client may write into a confinement: it comes from another host, perhaps."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What the server in a container says of its surroundings."""
 
-from __future__ import annotations
-
 import json
 import socket
 import threading

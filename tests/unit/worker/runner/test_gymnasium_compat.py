@@ -1,7 +1,5 @@
 """What a repository's objects are, before anything of theirs is called."""
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

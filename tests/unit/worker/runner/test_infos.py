@@ -1,7 +1,5 @@
 """Infos in the worker's own loop are Gymnasium's, and columns are the infos that they stand for."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

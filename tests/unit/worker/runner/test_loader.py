@@ -1,7 +1,5 @@
 """A caller's config object, made again of the plain values that have crossed."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The loop of a runner: a stream of requests, and the doorbell of the lane that it serves."""
 
-from __future__ import annotations
-
 import mmap
 import os
 import socket

@@ -1,7 +1,5 @@
 """How environments of ``gym`` are seeded and drawn: by what they take, whatever their release."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium

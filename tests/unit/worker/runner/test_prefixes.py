@@ -3,8 +3,6 @@
 What a runner watches: plain values of plain attributes; and that nothing changes unnoticed.
 """
 
-from __future__ import annotations
-
 import io
 import threading
 import warnings

@@ -1,7 +1,5 @@
 """What stands in for Gymnasium's vector environments: built when looked into, never by its end."""
 
-from __future__ import annotations
-
 import copy
 import gc
 import os

@@ -1,7 +1,5 @@
 """What an environment returns and no batch can hold is told with its call, space and line."""
 
-from __future__ import annotations
-
 import traceback
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a process has once: whatever of it changes is noticed, and named."""
 
-from __future__ import annotations
-
 import os
 import random
 import sys

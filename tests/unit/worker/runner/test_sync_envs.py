@@ -1,7 +1,5 @@
 """What the worker's own loop over sub-environments makes of options and of infos."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """Spaces that a vector environment does not declare, or declares the same for one and for all."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Where numpy's threads are set, and where they cannot be."""
 
-from __future__ import annotations
-
 import ctypes
 
 import numpy as np

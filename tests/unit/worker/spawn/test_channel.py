@@ -1,7 +1,5 @@
 """Messages with descriptors between our own processes."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os

@@ -3,8 +3,6 @@
 The stub of LeRobot: the names of its contract, and only where it is not installed.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import sys

@@ -1,7 +1,5 @@
 """The server's side of zygote, inits and runners, against real processes."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal

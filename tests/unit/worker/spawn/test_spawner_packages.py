@@ -1,7 +1,5 @@
 """Packages of a repository's own in a jail: where they are found, and by whom."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

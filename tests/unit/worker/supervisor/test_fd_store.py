@@ -1,7 +1,5 @@
 """What a server keeps of descriptors that are brought: five of a known runner's, and no others."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 

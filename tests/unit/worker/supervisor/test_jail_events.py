@@ -1,7 +1,5 @@
 """What happens to jails, and in which order a server hears of it."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager

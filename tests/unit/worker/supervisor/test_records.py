@@ -1,7 +1,5 @@
 """How long a jail has been idle, by what passes the server and what passes its slabs."""
 
-from __future__ import annotations
-
 import os
 import struct
 

@@ -1,7 +1,5 @@
 """The stream to one runner: what was asked is answered in order, and nothing else is taken."""
 
-from __future__ import annotations
-
 import socket
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """The server takes a runner's steps: asks, hears and copies, and never waits for the runner."""
 
-from __future__ import annotations
-
 import errno
 import itertools
 import mmap

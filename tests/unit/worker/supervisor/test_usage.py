@@ -3,8 +3,6 @@
 Here with this process for a runner.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Episodes are counted right in every autoreset mode, whatever the environment answers."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """What a play gives to look at: bounded, and never a reason to fail."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

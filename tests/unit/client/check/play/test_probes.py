@@ -1,7 +1,5 @@
 """Single probes: what episodes leave behind, what render gives, and what LeRobot needs."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """What of one sub-environment's step is no finding, and what is."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a play notices, of an environment that does what a script says."""
 
-from __future__ import annotations
-
 import itertools
 import tracemalloc
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Frames are judged before they are encoded, and a written video can be read."""
 
-from __future__ import annotations
-
 import importlib.util
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """A commit of git is fetched as data: no hook, filter, submodule, login or other protocol."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import tracemalloc

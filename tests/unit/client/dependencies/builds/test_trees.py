@@ -1,7 +1,5 @@
 """Source archives are unpacked as data: within bounds, without links, and nowhere else."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import os

@@ -1,7 +1,5 @@
 """A wheel out of a jail is a stranger's: it is what was asked for, or it is refused."""
 
-from __future__ import annotations
-
 import stat
 import tracemalloc
 import zipfile

@@ -1,7 +1,5 @@
 """The monitor of a container, with a script for an engine."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

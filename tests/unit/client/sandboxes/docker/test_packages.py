@@ -1,7 +1,5 @@
 """Packages for a container: whether the image has them, or this machine's fit; and images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

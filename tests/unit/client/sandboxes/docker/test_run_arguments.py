@@ -1,7 +1,5 @@
 """From a policy to an engine's command line, and from what a container says to what holds."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re

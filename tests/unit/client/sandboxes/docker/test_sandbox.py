@@ -1,7 +1,5 @@
 """A container by a port or by mounts, with a program for an engine that makes none."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """Which slot a batch is in, who may still write it, and what a hostile byte becomes."""
 
-from __future__ import annotations
-
 import os
 import select
 import socket

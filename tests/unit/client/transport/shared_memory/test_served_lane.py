@@ -1,7 +1,5 @@
 """Our half of slabs that a server has: what it sends is what the runner wrote, and no more."""
 
-from __future__ import annotations
-
 import mmap
 import os
 import struct

@@ -1,7 +1,5 @@
 """What clients bring: of a store that several servers of a machine use, and of one key."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What init measures, where control groups are, and what removes a stranger's files."""
 
-from __future__ import annotations
-
 import mmap
 import os
 import socket

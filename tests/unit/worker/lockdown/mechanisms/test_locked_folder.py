@@ -1,7 +1,5 @@
 """What servers that were killed have left is removed, and nothing else."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Ending all processes below one."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

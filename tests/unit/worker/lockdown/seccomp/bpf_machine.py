@@ -1,7 +1,5 @@
 """A classic BPF interpreter for seccomp data: what the kernel would answer; and a listing."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """The BPF assembler, judged by an interpreter."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

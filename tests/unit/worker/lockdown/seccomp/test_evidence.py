@@ -3,8 +3,6 @@
 And whether one is about a process of the jail's own: here, this process's children.
 """
 
-from __future__ import annotations
-
 import ctypes
 import mmap
 import os

@@ -1,7 +1,5 @@
 """Calls that ask init before they are made: no signal interrupts them, and a caller may go."""
 
-from __future__ import annotations
-
 import errno
 import os
 import select

@@ -1,7 +1,5 @@
 """The system call filter, run in an interpreter over (architecture, number, arguments)."""
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Sequence
 from pathlib import Path
