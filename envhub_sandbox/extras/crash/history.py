@@ -30,6 +30,7 @@ _MOST_LASTING = 256
 _LASTING = (m.Call, m.SetAttr, m.CallOwn, m.CallOne)
 _PASSING = frozenset({"reset", "step", "render"})
 """What is over with the next seed, also where one sub-environment does it alone."""
+_FIXED = frozenset({bool, int, float, complex, str, bytes, type(None)})
 _SLICED: dict[type[m.Message], tuple[str, ...]] = {
     m.Reset: ("seeds", "mask"),
     m.SetAttr: ("values",),
@@ -69,7 +70,10 @@ class History(Recorder):
 
     def step(self, actions: Any) -> None:
         """See ``Recorder``."""
-        self._add(_copied(actions))
+        try:
+            self._add(_copied(actions))
+        except TypeError:
+            self._add(RecordedRequest(encoded(m.Step(0, actions))))
 
     def requested(self, request: Request) -> None:
         """See ``Recorder``. What a reset of all seeds does not depend on what was asked before it,
@@ -156,13 +160,17 @@ def _joined(slices: Sequence[Any]) -> Any:
 
 
 def _copied(actions: Any) -> Any:
-    """Actions that their owner cannot change any more: arrays copied, containers rebuilt."""
-    if type(actions) is np.ndarray:
+    """Actions that their owner cannot change any more: arrays copied, containers rebuilt.
+    Raises ``TypeError``: of a tensor, for instance, neither that nor the size is known.
+    """
+    if type(actions) is np.ndarray and not actions.dtype.hasobject:
         return actions.copy()
     if isinstance(actions, Mapping):
         return {key: _copied(item) for key, item in actions.items()}
     if isinstance(actions, (tuple, list)):
         return [*map(_copied, actions)] if type(actions) is list else tuple(map(_copied, actions))
+    if type(actions) not in _FIXED and not isinstance(actions, (np.number, np.bool_)):
+        raise TypeError
     return actions
 
 

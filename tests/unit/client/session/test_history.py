@@ -91,20 +91,15 @@ def test_requests_come_back_in_order() -> None:
 
 def test_the_caller_may_change_his_actions() -> None:
     """What was sent is kept, whatever becomes of the array, the mapping or the options."""
-    kept, array, parts, options = (
-        History(100),
-        np.array([1, 2]),
-        {"a": np.array([1, 2])},
-        {"b": [1]},
-    )
-    kept.step(array)
-    kept.step(parts)
+    kept, array, options = History(100), np.array([1, 2]), {"b": [1]}
+    for actions in (array, {"a": array}, [array.view(np.matrix)], np.array([array, None], object)):
+        kept.step(actions)
     ask(kept, m.Reset(0, None, options, np.array([True, False])))
-    array[:] = parts["a"][:] = 0
+    array[:] = 0
     options["b"].append(2)
-    flat, nested, masked = messages_of(kept)
-    assert_same(flat.actions, np.array([1, 2]))
-    assert_same(nested.actions, {"a": np.array([1, 2])})
+    flat, nested, listed, several, masked = messages_of(kept)
+    for actions in (flat.actions, nested.actions["a"], listed.actions[0], several.actions[0]):
+        assert actions.ravel().tolist() == [1, 2]
     assert masked.options == {"b": [1]}
 
 
@@ -147,12 +142,14 @@ def test_the_oldest_gives_way(limit: int, steps: int) -> None:
     assert actions_of(kept) == [[number] * 2 for number in range(max(0, steps - limit), steps)]
 
 
-@pytest.mark.parametrize("nested", [False, True])
-def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch, nested: bool) -> None:
+@pytest.mark.parametrize(
+    "actions", [np.zeros((1, 1000)), {"a": np.zeros(1000)}, np.zeros((1, 1000)).view(np.matrix)]
+)
+def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch, actions: Any) -> None:
     monkeypatch.setattr(history, "HISTORY_BYTES", 100_000)
-    kept, actions = History(1000), np.zeros((1, 1000))
+    kept = History(1000)
     for _ in range(100):
-        kept.step({"a": actions} if nested else actions)
+        kept.step(actions)
     assert 5 <= len(kept.recording()) <= 12
     for _ in range(30):
         ask(kept, m.Reset(0, None, {"map": np.zeros(5000)}, np.array([True])))
