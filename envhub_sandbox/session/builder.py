@@ -68,7 +68,8 @@ class JailSource:
 class SharedJail(JailSource):
     """One jail for all environments of a repository, each with a connection of its own.
 
-    A death or a time-out of one environment takes the others' process along: they share it.
+    A death or a time-out of one environment takes the others' process along: they share it. A dead
+    jail is closed after its last user has left it: its server tells each of them how it ended.
     """
 
     shared = True
@@ -79,6 +80,7 @@ class SharedJail(JailSource):
         self._lock = threading.RLock()  # interruption.md, rule 12
         self._owner = OwnerProcess()
         self._first: LoadedJail | None = None
+        self._dead: list[LoadedJail] = []
         self._users: weakref.WeakSet[LoadedJail] = weakref.WeakSet()
 
     def provide(self, loaded: LoadedJail) -> None:
@@ -88,8 +90,10 @@ class SharedJail(JailSource):
         weakref.finalize(self, self.launcher.close, loaded).atexit = False
 
     def take(self, deadline: Deadline) -> LoadedJail:
-        """A connection to the jail, which is opened if there is none."""
+        """A connection to the jail, which is opened if there is none that lives."""
         with self._lock:
+            if self._first is not None and not self.launcher.lives(self._first):
+                self._leave_first()
             if self._first is None:
                 self._first = self.launcher.open(deadline)
             connected = self.launcher.connect(self._first, deadline)
@@ -98,32 +102,44 @@ class SharedJail(JailSource):
 
     def end(self, loaded: LoadedJail) -> None:
         """End the jail, for all environments."""
-        self.launcher.interrupt(loaded)
+        lives = self.launcher.lives(loaded)
+        if lives is not False:
+            self.launcher.interrupt(loaded)
         with self._lock:
-            if self._first is not None and self._first.jail.number == loaded.jail.number:
-                self._close_first()
+            first = self._first
+            if first is not None and first.jail.number == loaded.jail.number:
+                self._leave_first()
+                if lives is not False:
+                    self.launcher.close(first)
 
     def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
-        """Drop a connection; with the last one the jail ends."""
+        """Drop a connection; with its last one a jail ends."""
         self.launcher.disconnect(loaded)
         loaded.jail.watched.forget()  # a lost reply may have named changed attributes
         with self._lock:
             self._users.discard(loaded)
-            if not self._users:
-                self._close_first()
+            self._close_unused()
 
     def close(self) -> None:
         """End a jail that was provided and never taken. A fork of its owner does nothing."""
         if not self._owner.is_here:
             return
         with self._lock:
-            if not self._users:
-                self._close_first()
+            self._close_unused()
 
-    def _close_first(self) -> None:
-        first = self._first
-        if first is not None:
-            self.launcher.close(first)  # interruption.md, rule 7
+    def _leave_first(self) -> None:
+        """Have the next user open another jail."""
+        if self._first is not None:
+            self._dead.append(self._first)
+            self._first = None
+
+    def _close_unused(self) -> None:
+        used = {user.jail.number for user in self._users}
+        for jail in [jail for jail in self._dead if jail.jail.number not in used]:
+            self.launcher.close(jail)  # interruption.md, rule 7
+            self._dead.remove(jail)
+        if self._first is not None and self._first.jail.number not in used:
+            self.launcher.close(self._first)  # as above
             self._first = None
 
 

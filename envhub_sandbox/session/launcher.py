@@ -421,6 +421,16 @@ class Launcher:
             pass
         return {}
 
+    def lives(self, loaded: LoadedJail) -> bool | None:
+        """Whether a jail lives, as its server says; None if it does not answer.
+        One that does is not idle then.
+        """
+        try:
+            look = m.ReadOutput(loaded.jail.number, "make_env")
+            return isinstance(self._ask(loaded.server, look, Deadline(_CLOSE_S)), m.Output)
+        except EnvHubError:
+            return None
+
     def denials(self, server: WorkerServer, jail: int) -> tuple[str, ...] | None:
         """What a jail was denied; None if that is not recorded, or not known any more."""
         if not self.repository.policy.record_denials:

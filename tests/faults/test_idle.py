@@ -157,3 +157,27 @@ def test_other_tasks_go_on() -> None:
         assert eventually(goes_on, 200)
         assert state(second) is State.READY
         brought_back(first)
+
+
+@lanes
+def test_tasks_that_share_a_jail_come_back_one_by_one(lane: str) -> None:
+    """Also one that was never used, one that asks after another has come back, and again later."""
+    kwargs = {"form": "built"}
+    timeouts, policy = {"idle_s": IDLE_S}, {"lane": lane}
+    with make_env(
+        sample("mortal"), n_envs=4, env_kwargs=kwargs, timeouts=timeouts, policy=policy
+    ) as suites:
+        first, second = suites["suite"].values()
+        for _ in range(2):
+            assert ended(played(first))
+            brought_back(second)
+            with pytest.raises(errors.WorkerDiedError, match=r"idle.*reset\(\)"):
+                first.step(ALL_LIVE)
+            assert ended(played(first) + played(second))
+            brought_back(first)
+            observation, _ = brought_back(second)
+            assert observation.tolist() == oracle().reset(seed=SEED)[0].tolist()
+        assert ended(played(first))
+        brought_back(first)
+        second.close()
+        first.close()

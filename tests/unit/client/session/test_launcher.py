@@ -274,11 +274,21 @@ def test_it_is_opened_once_and_ends_with_its_last_user(opener: Any) -> None:
     assert (opener.open.call_count, opener.close.call_count) == (1, 3)
 
 
-def test_a_worker_that_is_given_up_is_given_up_for_all(opener: Any) -> None:
-    """They share its process; a jail of one's own is nobody else's."""
+@pytest.mark.parametrize(("lives", "ended"), [(True, 1), (None, 1), (False, 0)])
+def test_a_worker_that_is_given_up_is_given_up_for_all(
+    opener: Any, lives: bool | None, ended: int
+) -> None:
+    """They share its process; a jail of one's own is nobody else's. What is dead stays until the
+    last has left it, for the server to say why.
+    """
     source = SharedJail(opener, lambda: None)
-    one, _ = source.take(Deadline(None)), source.take(Deadline(None))
-    source.end(one)
-    assert (opener.interrupt.call_count, opener.close.call_count) == (1, 1)
+    users = [source.take(Deadline(None)) for _ in range(2)]
+    opener.lives.return_value = lives
+    source.end(users[0])
+    assert (opener.interrupt.call_count, opener.close.call_count) == (ended, ended)
+    for user in users:
+        assert opener.close.call_count == ended
+        source.give_back(user)
+    assert opener.close.call_count == ended + 1
     own = JailSource(opener, lambda: None)
     assert own.take(Deadline(None)) is not own.take(Deadline(None))
