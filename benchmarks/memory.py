@@ -1,6 +1,6 @@
 """How much memory 1, 4, 16 and 64 CartPoles take, with shared pages divided among their sharers.
 
-Root may read all of it.
+``python -m benchmarks memory`` has no arguments; root may read all of it.
 """
 
 from __future__ import annotations

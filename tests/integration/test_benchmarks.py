@@ -6,6 +6,8 @@ import re
 import subprocess
 from pathlib import Path
 
+import pytest
+
 from tests.support.command_line import python
 
 SHORT = "auto --workloads cartpole --sizes 2 --rounds 1 --seconds 0.01 --busy 1"
@@ -42,3 +44,10 @@ def test_the_benchmarks_are_listed_with_a_sentence_each(checkout: Path) -> None:
     words = {line.split()[0]: line.split(maxsplit=1)[1] for line in lines}
     assert {"auto", "growth", "remote", "steps", "suites", "reach", "memory"} <= {*words}
     assert all(text.endswith(".") for text in words.values())
+
+
+@pytest.mark.parametrize("name", ["memory", "remote", "venvs"])
+def test_a_benchmark_describes_itself_instead_of_running(checkout: Path, name: str) -> None:
+    """Also those that read no options."""
+    told = benchmark(checkout, "benchmarks", name, "--help").stdout
+    assert f"python -m benchmarks {name}" in told
