@@ -41,7 +41,6 @@ _COMMANDS = dict(commands())
 
 
 def help_of(name: str, width: int = _WIDTH, option: str = "--help-all") -> str:
-    """What a help prints."""
     done = CliRunner().invoke(
         app, [*name.split(), option], env={"COLUMNS": str(width), "TERM": "dumb"}
     )
@@ -50,7 +49,6 @@ def help_of(name: str, width: int = _WIDTH, option: str = "--help-all") -> str:
 
 
 def plain(text: str) -> str:
-    """Text without the boxes around it, and with single spaces."""
     return " ".join(re.sub("[│╭╮╰╯─]", " ", text).split())
 
 
@@ -130,7 +128,6 @@ def test_values_are_completed(words: str, completed: set[str]) -> None:
 
 @pytest.mark.parametrize("words", ["check ./x --sandbox none", "replay ./x --sandbox none"])
 def test_what_needs_a_sandbox_offers_no_way_without(words: str) -> None:
-    """Neither in its help nor in the error, which names no option that it does not have."""
     name = words.split()[0]
     assert "none" not in re.findall(r"--sandbox.*", help_of(name, 1_000))[0]
     done = CliRunner().invoke(app, words.split())
@@ -153,7 +150,6 @@ def test_no_command_is_left(command: str, before: str) -> None:
 
 @given(st.lists(st.sampled_from([*"::##[ \n\rvso", "section_start", "x", "\x1b[1m"])))
 def test_a_command_in_pieces_is_none(pieces: list[str]) -> None:
-    """However many writes it comes in, and what is no command stays as it is."""
     whole = neutralised("".join(pieces))
     assert obeyed(whole) == []
     if not obeyed("".join(pieces)):
@@ -216,7 +212,6 @@ def test_wrong_usage_is_one_message(words: list[str], says: str) -> None:
 
 
 def test_one_place_writes() -> None:
-    """No command prints by itself, and none makes a console of its own."""
     found = []
     for path in Path(next(iter(envhub_sandbox.cli.__path__))).rglob("*.py"):
         if path.name in ("console.py", "progress.py"):
@@ -234,7 +229,6 @@ def test_one_place_writes() -> None:
 
 
 def in_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of 34 columns, without colours."""
     monkeypatch.setenv("TERM", "dumb")
     monkeypatch.setenv("COLUMNS", "34")
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)

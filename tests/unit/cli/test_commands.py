@@ -40,7 +40,6 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def said(*words: str) -> tuple[int, str]:
-    """The exit code of a command, and all that it prints."""
     done = CliRunner().invoke(app, words)
     return done.exit_code, done.output
 
@@ -76,7 +75,6 @@ _REFUSED = [
 
 @pytest.mark.parametrize(("words", "code", "text"), _REFUSED)
 def test_what_cannot_be_done_is_said_in_one_line(words: str, code: int, text: str) -> None:
-    """With the exit code of its kind, without a traceback, and nothing is left in the folder."""
     found, printed = said(*shlex.split(words))
     assert (found, text in " ".join(printed.split())) == (code, True), printed
     assert "Traceback" not in printed
@@ -92,7 +90,6 @@ def test_an_empty_store_is_listed() -> None:
 
 
 def test_a_snapshot_is_called_by_repository_or_commit() -> None:
-    """A commit by seven characters at least, or by fewer behind its repository."""
     one = cache.StoredSnapshot("org/repo", "0123456789", None, 0.0, 1, Path())
     for name in ("org/repo", "0123456", "org/repo@01", "0123456789"):
         assert one.answers_to(name), name

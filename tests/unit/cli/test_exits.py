@@ -64,7 +64,6 @@ def test_a_message_carries_no_traceback_and_no_escape_sequence() -> None:
 
 
 def fail(error: BaseException, *, debug: bool) -> int:
-    """What a command that raises exits with."""
     with pytest.raises(typer.Exit) as caught, reported(debug=debug):
         raise error
     return caught.value.exit_code
@@ -114,7 +113,6 @@ except typer.Exit as end:
     ],
 )
 def test_where_nothing_can_be_written_the_code_is_the_same(how: str, to: str, code: Exit) -> None:
-    """Both streams go to a full disk, or to a reader who has ended."""
     if to == "full":
         end = os.open("/dev/full", os.O_WRONLY)
     else:
@@ -170,7 +168,6 @@ def test_statistics_are_the_population_s() -> None:
 
 
 def result(*returns: tuple[float, ...]) -> TaskResult:
-    """A task in which these returns were earned."""
     fields: dict[str, Any] = {"sub_env": 0, "length": 3, "terminated": True, "success": None}
     rollout = Rollout(episodes=[Episode(returns=value, **fields) for value in returns])
     task: dict[str, Any] = {"suite": "s", "task": 0, "num_envs": 1, "autoreset_mode": None}

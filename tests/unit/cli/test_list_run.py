@@ -183,7 +183,6 @@ def test_a_strangers_words_are_text_in_every_form(
 
 @pytest.mark.parametrize("translates", [False, True])
 def test_what_takes_longer_is_interrupted(translates: bool) -> None:
-    """Whatever it waits for, and whatever it makes of the interrupt."""
     before = signal.getsignal(signal.SIGALRM)
     with pytest.raises(DeadlineReached), deadline_alarm(0.01):
         wait(translates)

@@ -80,7 +80,6 @@ def test_the_second_time_no_jail_is_opened(launcher: Launcher, server: LyingServ
 def test_other_code_of_the_worker_describes_it_anew(
     launcher: Launcher, server: LyingServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Wherever it lies, it is the same if none of its modules was changed."""
     described = list[int]()
     for name, changed in (("first", 1), ("same", 1), ("other", 2)):
         worker = tmp_path / name
@@ -109,7 +108,6 @@ def test_what_does_not_agree_leaves_no_jail(launcher: Launcher, server: LyingSer
 def test_a_suite_shares_a_jail_unless_it_is_lazy(
     launcher: Launcher, server: LyingServer, lazy: bool
 ) -> None:
-    """A lazy one gives each task a jail of its own, and the first, which described it, ends."""
     envs = tuple(env_manifest(task=task) for task in range(2))
     says(server, m.Load, m.LoadDone(encode_manifest(Manifest(envs=envs, lazy=lazy))))
     with suites(launcher) as made:
@@ -137,7 +135,6 @@ def test_a_suite_shares_a_jail_unless_it_is_lazy(
 def test_another_environment_is_refused_and_forgotten(
     launcher: Launcher, server: LyingServer, changes: dict[str, Any], described: bool
 ) -> None:
-    """Where the jail describes another, or builds another than it has described."""
     other, forgotten = env_manifest(**changes), list[bool]()
     if described:
         manifest = encode_manifest(Manifest(envs=(other,), lazy=True))
@@ -164,7 +161,6 @@ NEW = ("opencv-python (>=3) ; extra == 'all'", "b (>=1,<2)", "c>=4", "d (==1.*)"
 
 
 def required(wheel: Path) -> list[str]:
-    """What its metadata say that it needs."""
     with zipfile.ZipFile(wheel) as archive:
         text = archive.read("x-1.0.dist-info/METADATA").decode()
     return [line[15:] for line in text.splitlines() if line.startswith("Requires-Dist: ")]

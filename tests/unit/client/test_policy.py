@@ -44,7 +44,6 @@ def test_unknown_names_are_refused(make: Any, complaint: str) -> None:
 
 
 def _is(name: str, value: object, takes: str = "") -> Any:
-    """A value that a policy refuses, and what is said of it."""
     return lambda: Policy(**{name: value}), f"{name} is {re.escape(repr(value))}{takes}"
 
 
@@ -89,7 +88,6 @@ def _limit(name: str, value: object, takes: str = "") -> Any:
     ],
 )
 def test_impossible_values_are_refused(make: Any, complaint: str) -> None:
-    """The error names the field, the value, and what it takes."""
     with pytest.raises(PolicyError, match=complaint) as caught:
         make()
     assert isinstance(caught.value, ValueError)
@@ -124,7 +122,6 @@ def test_impossible_values_are_refused(make: Any, complaint: str) -> None:
     ],
 )
 def test_what_is_given_means(made: object, meant: object) -> None:
-    """Seconds or None, numbers of any type as ints, lists, paths, sizes, mappings and objects."""
     assert (made, type(made)) == (meant, type(meant))
 
 

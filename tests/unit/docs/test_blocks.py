@@ -32,7 +32,6 @@ def test_what_is_said_of_blocks_is_said_of_blocks_that_there_are() -> None:
 
 
 def commands(text: str) -> Iterator[list[str]]:
-    """The words of each command, without comments, variables and folders of programs."""
     text = re.sub(r"<[^>\n]*>", "X", text.replace("\\\n", " "))
     for line in text.splitlines():
         for command in line.split("&&"):
@@ -45,14 +44,12 @@ def commands(text: str) -> Iterator[list[str]]:
     "block", [one for one in blocks.blocks() if one.language in ("sh", "text", "")], ids=named
 )
 def test_commands_are_ones_that_there_are(block: Block) -> None:
-    """Those of shell, and those that are shown with their output."""
     shown = "\n".join(re.findall(r"^\$ (.*)$", block.text, re.M))
     for words in commands(block.text if block.language == "sh" else shown):
         held(words)
 
 
 def held(words: list[str]) -> None:
-    """One command is one that there is, or this fails."""
     program, *rest = words
     if program == "envhub":
         done = CliRunner().invoke(app, [*(word for word in rest if word != "..."), "--help"])

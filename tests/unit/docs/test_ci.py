@@ -72,7 +72,6 @@ def judged(checkout: Path, folder: Path, code: int = 0, **inputs: str) -> tuple[
 
 
 def test_the_action_judges_with_its_inputs(checkout: Path, tmp_path: Path) -> None:
-    """Each becomes an option, and the exit code is that of the check."""
     code, lines = judged(checkout, tmp_path, code=1, ref="./my env", allow="card licence")
     assert code == 1
     assert [line.strip("<>") for line in lines] == [
@@ -171,7 +170,6 @@ def test_the_job_for_gitlab_judges_with_its_variables(checkout: Path, tmp_path: 
 
 
 def words(checkout: Path, hook: str) -> list[str]:
-    """The command line of a hook of pre-commit, without the program."""
     [found] = [one for one in loaded(checkout, ".pre-commit-hooks.yaml") if one["id"] == hook]
     assert found["language"] == "python"
     program_name, *words = [*shlex.split(found["entry"]), *found["args"]]
@@ -190,7 +188,6 @@ def test_the_hook_that_reads_fails_for_what_hides(
 
 
 def test_what_is_named_exists(checkout: Path) -> None:
-    """The options that all three pass are those of the commands, by their own help."""
     texts = [
         loaded(checkout, "action.yml")["runs"]["steps"][1]["run"],
         loaded(checkout, "examples/ci/gitlab.yml")["envhub-check"]["script"][-1],
@@ -228,7 +225,6 @@ def installs(text: str) -> list[str]:
 
 
 def unlocked(lock: str, wanted: list[str]) -> list[str]:
-    """What a lock lacks, or has without a hash, of requirements under each Python on Linux."""
     pins = [line for line in lock.replace("\\\n", " ").splitlines() if not line.startswith("#")]
     missing = [pin for pin in pins if not re.search(r"--hash=sha256:[0-9a-f]{64}", pin)]
     for python in _PYTHONS:

@@ -29,7 +29,6 @@ needs_systemd = pytest.mark.skipif(
 
 
 def exported() -> dict[str, set[str]]:
-    """Every sample that a server with a client exports, and its labels."""
     parser = pytest.importorskip("prometheus_client.parser", reason="prometheus-client is missing")
     rules = Rules(
         keys=None,
@@ -100,7 +99,6 @@ def test_the_page_has_every_metric() -> None:
 
 
 def lines(name: str) -> list[str]:
-    """The values of a setting of the unit."""
     return re.findall(rf"^{name}=(.*)$", UNIT.read_text(), re.MULTILINE)
 
 

@@ -30,7 +30,6 @@ print(getattr(build_meta, sys.argv[1])(sys.argv[2]))
 
 
 def built(kind: str, source: Path, into: Path) -> Path:
-    """What the build backend makes of a folder, in an interpreter of its own."""
     into.mkdir(exist_ok=True)
     command = [sys.executable, "-c", BUILD, f"build_{kind}", str(into)]
     done = subprocess.run(
@@ -69,7 +68,6 @@ def told_by(wheel: Path) -> Message:
 
 
 def assert_fit(told: Message) -> None:
-    """A page that an index can show, and a licence."""
     assert told["Description-Content-Type"] == "text/markdown"
     assert len(str(told.get_payload() or told["Description"])) > 300
     assert told["License-Expression"] == "Apache-2.0"
@@ -122,7 +120,6 @@ def project() -> dict[str, Any]:
 
 
 def name_of(requirement: str) -> str:
-    """The distribution that a requirement names."""
     return re.split(r"[^\w-]", requirement, maxsplit=1)[0]
 
 
@@ -135,7 +132,6 @@ def test_the_workers_group_is_what_the_worker_imports(project: dict[str, Any]) -
 
 
 def test_the_image_can_be_watched(project: dict[str, Any]) -> None:
-    """It installs what the worker imports, and what its figures need, word for word."""
     installed = re.findall(
         r"--require-hashes -r /build/(\S+)", (CHECKOUT / "Dockerfile").read_text()
     )

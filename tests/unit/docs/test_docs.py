@@ -31,14 +31,12 @@ def named(path: Path) -> str:
 
 
 def section(text: str, title: str) -> str:
-    """The part of a document below a title, up to the next of the same rank."""
     [rank] = re.findall(rf"^(#+) {re.escape(title)}$", text, re.MULTILINE)
     part = text.partition(f"\n{rank} {title}\n")[2]
     return re.split(rf"^#{{2,{len(rank)}}} ", part, maxsplit=1, flags=re.MULTILINE)[0]
 
 
 def rows(text: str) -> list[list[str]]:
-    """The cells of every row of the tables in a text, without their heads."""
     lines = [line for line in text.splitlines() if line.startswith("|")]
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     heads = {index - 1 for index, row in enumerate(cells) if set("".join(row)) <= set("-: ")}
@@ -46,12 +44,10 @@ def rows(text: str) -> list[list[str]]:
 
 
 def code_words(text: str) -> list[str]:
-    """What stands in backquotes, outside of blocks of code."""
     return re.findall(r"`([^`]+)`", re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S))
 
 
 def sources() -> str:
-    """The source of both packages, as one text."""
     packages = [folder("envhub_sandbox"), folder("envhub_worker")]
     return "\n".join(path.read_text() for root in packages for path in root.rglob("*.py"))
 
@@ -146,14 +142,12 @@ def test_the_pages_before_internals_are_few_enough_to_read() -> None:
 
 
 def links(text: str) -> Iterator[str]:
-    """The targets of all links that stay in the project."""
     for target in re.findall(r'(?:\]\(|srcset=")([^)"\s]+)[)"]', text):
         if not target.startswith(("http://", "https://", "mailto:")):
             yield target
 
 
 def anchors(text: str) -> set[str]:
-    """The anchors that a forge makes of the titles."""
     titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
     kept = string.ascii_lowercase + string.digits + "-_ "
     return {

@@ -11,7 +11,6 @@ EXTRAS = ("envhub_sandbox.extras", "envhub_worker.extras", "envhub_sandbox.integ
 
 
 def is_extra(module: str) -> bool:
-    """Whether the core has to do without a module."""
     return any(below(module, extras) for extras in EXTRAS)
 
 

@@ -142,7 +142,6 @@ def folder(package: str) -> Path:
 
 @cache
 def modules() -> dict[str, ast.Module]:
-    """Every module of both packages, parsed."""
     found = {}
     for package in ("envhub_sandbox", "envhub_worker"):
         root = folder(package)
@@ -177,12 +176,10 @@ def arrows(package: str) -> Iterator[tuple[str, str]]:
 
 
 def below(target: str, package: str) -> bool:
-    """Whether a module is a package or lies in it."""
     return target == package or target.startswith(f"{package}.")
 
 
 def foreign(package: str, own: set[str]) -> list[tuple[str, str]]:
-    """Imports of a package that are neither the standard library's nor permitted."""
     return [
         (name, target)
         for name, target in arrows(package)
@@ -211,13 +208,11 @@ def test_protocol_does_no_io() -> None:
 
 
 def package_of(module: str) -> str:
-    """The folder or module right below one of the two packages, or below its extras."""
     parts = module.split(".")
     return ".".join(parts[: 3 if "extras" in parts[1:2] else 2])
 
 
 def may_import(package: str) -> set[str]:
-    """The packages that one may import, with full names."""
     top = package.split(".")[0]
     return LOWEST | {f"{top}.{name}".rstrip(".") for name in MAY_IMPORT[package]}
 
@@ -299,7 +294,6 @@ _LOADERS = ("load", "loads", "Unpickler")
 
 
 def loaders() -> Iterator[tuple[str, str]]:
-    """Every mention of a function that makes objects out of bytes, whoever has it."""
     for name, tree in modules().items():
         aliases = {}
         for node in ast.walk(tree):
@@ -324,7 +318,6 @@ def test_only_the_loader_imports_by_computed_names() -> None:
 
 
 def computes_imports(tree: ast.Module) -> bool:
-    """Whether a module executes code by a name that is not a literal."""
     for node in ast.walk(tree):
         if not isinstance(node, ast.Call):
             continue

@@ -34,7 +34,6 @@ class _Chosen:
 
 
 def _chosen(folder: Path, *options: str) -> set[str]:
-    """What pytest would run of a folder, with none of our plugins but the one in question."""
     chosen = _Chosen()
     apart = ["-c", os.devnull, f"--rootdir={folder}", "--import-mode=importlib"]
     apart += ["-p", "no:cacheprovider", "-p", "no:faulthandler", "-p", selection.__name__]

@@ -15,7 +15,6 @@ MOST = 95
 
 
 def bound_names(module: ast.Module) -> list[str]:
-    """The names of variables and parameters, once for each place that gives them a value."""
     nodes = list(ast.walk(module))
     stored = (n.id for n in nodes if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store))
     return [*stored, *(node.arg for node in nodes if isinstance(node, ast.arg))]

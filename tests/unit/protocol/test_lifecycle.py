@@ -8,7 +8,6 @@ from envhub_worker.protocol.lifecycle import TABLE, Event, Lifecycle, State
 
 
 def after(*events: Event) -> State:
-    """The state that some events lead to."""
     lifecycle = Lifecycle()
     for event in events:
         lifecycle.on(event)
@@ -24,7 +23,6 @@ def test_an_illegal_move_is_refused_and_changes_nothing() -> None:
 
 @given(st.lists(st.sampled_from(Event), max_size=12))
 def test_close_is_legal_at_every_moment_and_final(events: list[Event]) -> None:
-    """Whatever has happened, an environment can be closed, and then nothing more happens."""
     lifecycle = Lifecycle()
     for event in events:
         if (lifecycle.state, event) in TABLE:

@@ -99,7 +99,6 @@ def test_records_do_not_change() -> None:
 
 
 def test_equality_and_hash_go_by_compared_fields_of_one_class() -> None:
-    """A default is not shared, a field that is not compared does not count, a class does."""
     assert Named(only=1) == Named(only=1)
     assert hash(Named(only=1)) == hash(Named(only=1))
     assert Named(only=1) != Named(only=2)
@@ -130,7 +129,6 @@ def test_what_was_given_is_looked_at() -> None:
 
 
 def test_a_notebook_shows_the_fields() -> None:
-    """What is shown of a class is what it takes, as the standard library has it."""
     ours, theirs = inspect.signature(Ours).parameters, inspect.signature(Theirs).parameters
     assert [str(one) for one in ours.values() if one.name != "third"] == [
         str(one) for one in theirs.values() if one.name != "third"

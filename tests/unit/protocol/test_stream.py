@@ -21,12 +21,10 @@ packets = st.lists(st.tuples(st.integers(0, 2**63 - 1), frames), max_size=5)
 
 
 def head(count: int, *lengths: int, request_id: int = 1) -> bytes:
-    """The beginning of a packet, which may lie."""
     return struct.pack(f"<QQ{len(lengths)}Q", count, request_id, *lengths)
 
 
 def on_the_wire(sent: list[Plain]) -> bytes:
-    """What some packets look like one after the other."""
     return b"".join(bytes(part) for each in sent for part in pack_packet(*each))
 
 
@@ -35,7 +33,6 @@ def plain(packet: Packet) -> Plain:
 
 
 def read(chunks: list[bytes], limits: WireLimits = LIMITS) -> list[Plain]:
-    """The packets that come out of a stream that arrives in these chunks."""
     reader = StreamReader(limits)
     return [plain(packet) for chunk in chunks for packet in reader.feed(chunk)]
 
@@ -52,7 +49,6 @@ def test_packets_arrive_whole_however_the_stream_is_cut(sent: list[Plain], cuts:
 
 
 def test_a_packet_is_whole_and_its_own() -> None:
-    """Frames without bytes do not wait for the next packet, which changes nothing of the last."""
     reader = StreamReader(LIMITS)
     [empty] = reader.feed(on_the_wire([(3, [b"", b"", b""])]))
     assert plain(empty) == (3, [b"", b"", b""])
@@ -92,7 +88,6 @@ def test_lengths_at_the_limit_are_accepted() -> None:
 
 
 def test_declared_and_never_sent_costs_no_memory() -> None:
-    """A runner that promises 256 MB and sends nothing does not make anybody touch them."""
     limits = WireLimits()
     reader = StreamReader(limits)
     process = psutil.Process()
@@ -114,7 +109,6 @@ def test_many_small_packets_keep_nothing() -> None:
 
 
 def test_a_flood_of_small_packets_is_read_in_linear_work() -> None:
-    """Two hundred thousand packets in one chunk come out one by one, without copying the rest."""
     flood = head(1, 0) * 200_000
     assert sum(1 for _ in StreamReader(LIMITS).feed(flood)) == 200_000
 

@@ -27,19 +27,16 @@ def test_words_stay_words(text: str) -> None:
     ],
 )
 def test_control_characters_are_shown_instead_of_obeyed(text: str, shown: str) -> None:
-    """Escape sequences, carriage returns and overrides become text."""
     assert printable(text) == shown
 
 
 @given(st.text(st.characters(exclude_categories=())))
 def test_nothing_unprintable_is_left(text: str) -> None:
-    """Whatever comes in, only printable characters, line ends and tabs come out."""
     assert all(char in "\n\t" or char.isprintable() for char in printable(text))
 
 
 @given(st.text(max_size=200), st.integers(2, 100))
 def test_length_is_bounded(text: str, limit: int) -> None:
-    """The middle of what is too long is left out, and the text says how much of it."""
     shown = printable("x" * len(text), limit)
     if len(text) <= limit:
         assert shown == "x" * len(text)

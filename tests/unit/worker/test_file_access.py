@@ -31,7 +31,6 @@ print(json.dumps(found))
 
 @pytest.fixture
 def packages() -> Iterator[Path]:
-    """A folder that every user can reach, with packages that not everybody may read."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         for place in ("open", "closed", "half", "half/inner"):

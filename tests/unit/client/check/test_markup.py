@@ -22,7 +22,6 @@ def test_text_has_no_meaning_for_html(limit: int) -> None:
 
 
 def test_parts_of_a_page() -> None:
-    """Facts, what is folded, and tables, in which each cell has the head of its column."""
     made = "".join([*markup.facts([(_HOSTILE, 3)]), *markup.folded(_HOSTILE, ["<b>in</b>"])])
     assert Page(made).names == {"dl", "dt", "dd", "details", "summary", "b"}
     table = "\n".join(markup.table(["A", _HOSTILE], [("<i>1</i>", "2")]))
@@ -60,7 +59,6 @@ _DRAWN: dict[str, Callable[[Sequence[float]], str]] = {
 @pytest.mark.parametrize("kind", _DRAWN)
 @pytest.mark.parametrize("numbers", _NUMBERS)
 def test_what_is_drawn_lies_in_the_plot(kind: str, numbers: str) -> None:
-    """It is well formed, and each place is a number between the edges."""
     drawn = _DRAWN[kind](_NUMBERS[numbers])
     if kind == "course" and numbers in ("one", "not all"):
         assert drawn == "", "of one point there is no line, nor through what is no number"
@@ -128,7 +126,6 @@ def test_bars_stand_for_their_numbers() -> None:
 
 
 def test_every_step_is_counted_once() -> None:
-    """The fastest and the slowest, too."""
     drawn = ElementTree.fromstring(histogram_plot("x", [0.001 * value for value in range(1, 400)]))
     titles = [str(one[0].text) for one in drawn if len(one)]
     assert sum(int(title.rpartition(" ")[2]) for title in titles) == 399

@@ -60,7 +60,6 @@ def test_a_page_needs_and_runs_nothing() -> None:
 
 
 def test_what_was_played_can_be_seen() -> None:
-    """Pictures, a film, a plot of each thing, and figures with units for people."""
     made = report_of(_QUIET)
     made.figures["a / 0"] = {"steps": 200.0, "step_mean_s": 0.0123, "memory_bytes": 3.0 * 2**30}
     found = Page(page(made, []))
@@ -76,7 +75,6 @@ def test_what_was_played_can_be_seen() -> None:
 
 
 def test_pictures_are_no_reason_for_a_page_of_any_size() -> None:
-    """What does not fit any more is left out, and the page says so."""
     made = report_of(_QUIET)
     for number in range(30):
         film = Film((b"s" * (1 << 20),), b"v" * (2 << 20), frames=9, fps=3.0)

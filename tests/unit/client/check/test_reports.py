@@ -16,7 +16,6 @@ from tests.support.output.pages import HOSTILE
 
 
 def report(text: str) -> Report:
-    """One in which a repository chose every word that it can."""
     made = Report(text)
     made.add(Finding("runs", text, task=text, file=text, line=3))
     made.judged("loads", [], text)
@@ -117,7 +116,6 @@ def test_all_that_there_can_be_is_a_line_and_no_notice() -> None:
 
 
 def test_findings_are_bounded() -> None:
-    """Neither their number nor their length is a repository's choice."""
     made = Report("./walk:env.py")
     for number in range(600):
         made.add(Finding("runs", "x" * 100_000, task="t" * 10_000, file="f" * 10_000, line=number))
@@ -146,7 +144,6 @@ def mixed() -> Report:
 
 
 def test_the_most_severe_stands_first_in_every_form() -> None:
-    """Those of one severity stay in the order in which they were found."""
     made = mixed()
     failures = made.failures(Severity.WARNING, ["runs"])
     order = ["runs", "seeding", "slow-steps", "denied-files", "card", "licence"]
@@ -215,7 +212,6 @@ def test_advice_follows_from_the_error(cause: str, says: str) -> None:
 
 
 def test_what_was_not_judged_is_told_in_every_form() -> None:
-    """Checks that were made of nothing, and tasks that were not played to their end."""
     made = mixed()
     made.waiting = ["a / 0", "b / 1"]
     made.stopped(900, "a / 0")

@@ -71,7 +71,6 @@ def test_a_file_that_says_nothing_is_refused(text: str, says: str, tmp_path: Pat
 
 
 def test_what_is_judged_has_no_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether a folder is judged or a file, and by whatever link one gets there."""
     judged, link = tmp_path / "judged", tmp_path / "link"
     (judged / "sub").mkdir(parents=True)
     (judged / "env.py").touch()

@@ -32,7 +32,6 @@ def zipped(*names: str) -> bytes:
 
 
 def repository(folder: Path, name: str, data: bytes | str) -> Path:
-    """One with its papers and a further file."""
     write_repository(folder, _ENTRY, README__md="# x", LICENSE="MIT")
     (folder / name).parent.mkdir(parents=True, exist_ok=True)
     (folder / name).write_bytes(data.encode() if isinstance(data, str) else data)
@@ -54,13 +53,11 @@ def surveyed(snapshot: Snapshot) -> Survey:
 
 
 def found(folder: Path, data: bytes | str, name: str = "odd.py") -> list[tuple[str, int]]:
-    """The checks, with lines, of what is found in one further file."""
     repository(folder, name, data)
     return [(one.id, one.line) for one in surveyed(local(folder)).findings if one.file == name]
 
 
 def of_each(folder: Path, texts: list[str]) -> dict[str, set[tuple[str, int]]]:
-    """The checks, with lines, of what is found in a file of each text."""
     for number, text in enumerate(texts):
         repository(folder, f"odd{number}.py", text)
     told = surveyed(local(folder)).findings
@@ -175,7 +172,6 @@ _HONEST = [
 
 
 def test_honest_code_is_not_named(tmp_path: Path) -> None:
-    """Names that look alike, and letters of other languages."""
     named = {text: told for text, told in of_each(tmp_path / "r", _HONEST).items() if told}
     assert named == {}
 
@@ -236,14 +232,12 @@ def test_files_are_told_by_their_beginnings_and_ends(
     ids=["syntax", "null", "nesting", "deep", "bytes", "large"],
 )
 def test_what_cannot_be_read_is_said(text: str, check: str, tmp_path: Path) -> None:
-    """No crash, no recursion without end, no time for what no person wrote, and no silence."""
     checks = {check for check, _ in found(tmp_path / "r", text.encode("latin-1"))}
     assert check in checks
     assert checks <= {check, "source-hidden", "source-obscure"}
 
 
 def test_places_are_named_with_their_lines(tmp_path: Path) -> None:
-    """A hidden character once in each line, and a line that nobody reads to its end."""
     text = "a = 1\nb = '\u202ec\u202e'\nd = '\u200b'\ne = '" + "x y " * 700 + "'\n"
     repository(tmp_path / "r", "odd.py", text)
     told = [one for one in surveyed(local(tmp_path / "r")).findings if one.file == "odd.py"]
@@ -360,7 +354,6 @@ _SOURCES = st.lists(st.one_of(_COOKIES, st.sampled_from(_PIECES)), max_size=7).m
 
 
 def tree(source: bytes | str) -> str | None:
-    """What Python makes of it, if it takes it."""
     try:
         return ast.dump(compile(source, "file", "exec", ast.PyCF_ONLY_AST, dont_inherit=True))
     except (SyntaxError, ValueError, RecursionError, MemoryError):

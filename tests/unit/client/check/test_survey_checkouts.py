@@ -29,13 +29,11 @@ def repository(tmp_path: Path, snapshot_store: Path) -> GitRepository:
 
 
 def found(folder: Path) -> list[Finding]:
-    """What is found where a folder is read."""
     snapshot = local(folder)
     return survey(snapshot, parsing.read(snapshot)).findings
 
 
 def failing(folder: Path) -> set[str]:
-    """The files that fail, all by one check."""
     reported = [one for one in found(folder) if one.check.severity is Severity.ERROR]
     assert {one.id for one in reported} <= {"source-uncommitted"}
     return {one.file for one in reported}
@@ -80,7 +78,6 @@ def test_what_git_ignores_is_a_note(repository: GitRepository) -> None:
 
 
 def cloned_as_it_is(repository: GitRepository, folder: Path, name: str, text: str) -> Path:
-    """A clone of the repository with a file that no filter of git's has changed."""
     (folder / "raw").write_text(text, newline="")
     blob = repository.git("hash-object", "-w", "--no-filters", str(folder / "raw"))
     repository.git("update-index", "--add", "--cacheinfo", f"100644,{blob},{name}")
@@ -144,7 +141,6 @@ def test_a_pointer_in_place_of_a_file_is_reported(repository: GitRepository) -> 
 
 
 def test_what_git_does_not_look_at_is_reported(repository: GitRepository, tmp_path: Path) -> None:
-    """Repositories within it, and files that it keeps as they were."""
     shutil.copytree(repository.folder, repository.folder / "inner")
     repository.git("update-index", "--assume-unchanged", "LICENSE")
     assert failing(repository.folder) == {"inner/", "LICENSE"}
@@ -204,7 +200,6 @@ _ENTRY = {"env.py": ("100644", b"def make_env(): pass\n")}
 
 
 def commit(folder: Path, files: dict[str, tuple[str, bytes]]) -> None:
-    """Make a commit of exactly these blobs, with nothing in a folder."""
     subprocess.run(["git", "init", "--quiet", "--initial-branch=main", folder], check=True)
     parts = [b"commit refs/heads/main\n", _COMMITTER.encode(), b"data 0\n"]
     for path, (mode, data) in files.items():

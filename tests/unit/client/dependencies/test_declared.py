@@ -25,7 +25,6 @@ def plain(found: DeclaredPackages | None) -> list[str]:
 
 
 def script(*lines: str) -> str:
-    """An entry file with these lines of metadata."""
     inside = "".join(f"# {line}\n" for line in lines)
     return f"# /// script\n{inside}# ///\nimport this_never_runs\n"
 
@@ -106,7 +105,6 @@ def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-8-sig"])
 def test_what_windows_writes_is_read(tmp_path: Path, encoding: str) -> None:
-    """PowerShell's redirection gives UTF-16, editors a byte order mark."""
     (tmp_path / "requirements.txt").write_bytes("numpy>=2\r\nfoo\r\n".encode(encoding))
     assert [str(one) for one in read(tmp_path, "requirements.txt")[0]] == ["numpy>=2", "foo"]
 
@@ -175,8 +173,6 @@ def test_what_was_seen_and_not_read_is_said(tmp_path: Path) -> None:
 
 
 def test_the_most_particular_file_counts(tmp_path: Path) -> None:
-    """The entry file's own metadata, then requirements.txt, then the project."""
-
     def found(**files: str) -> tuple[str, list[str], str]:
         made = repository(tmp_path, **files)
         return made.source, plain(made), made.python

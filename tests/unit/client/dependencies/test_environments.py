@@ -34,7 +34,6 @@ CHECKOUT = Path(__file__).resolve().parents[4]
 
 
 def repository(folder: Path, *lines: str) -> Path:
-    """A repository that needs these packages."""
     folder.mkdir(exist_ok=True)
     (folder / "env.py").write_text("")
     (folder / "requirements.txt").write_text("".join(f"{line}\n" for line in lines))
@@ -103,7 +102,6 @@ def test_a_cache_below_a_folder_of_tests_has_bytecode(
 
 
 def test_the_same_again_asks_nobody(index: Index, tmp_path: Path) -> None:
-    """Neither for versions nor for packages, also for another repository that needs the same."""
     first = made(repository(tmp_path / "a", "numpy"))
     index.broken, asked = 503, len(index.asked)
     assert made(tmp_path / "a").home == first.home
@@ -263,7 +261,6 @@ def test_one_that_is_used_stays_and_the_answer_names_its_user(index: Index, tmp_
 def test_what_fails_between_choosing_and_installing_leaves_nothing(
     index: Index, tmp_path: Path
 ) -> None:
-    """A file that was replaced, and an index that has gone away."""
     wheel = make_wheel(index.folder, "wanted")
     folder = repository(tmp_path / "repo", "wanted")
     known(folder)
@@ -348,7 +345,6 @@ def test_what_another_uv_unpacks_is_left_to_it(
 
 
 def refused() -> None:
-    """An installation of nothing, which is refused."""
     with contextlib.suppress(DependencyError), uv.cleared_after_refusal(["none==1"]):
         (index_settings.uv_cache() / ".tmpours").touch()
         raise DependencyError("another hash", reason="integrity")

@@ -82,7 +82,6 @@ def requirements(found: Snapshot) -> list[str]:
     ],
 )
 def test_what_it_needs_is_read_off_its_text(tmp_path: Path, text: str, wanted: list[str]) -> None:
-    """What is imported where make_env leads to, unless it goes on without."""
     assert requirements(snapshot(tmp_path / "r", text)) == wanted
 
 
@@ -287,7 +286,6 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def request(name: str, **fields: Any) -> PackageRequest:
-    """A repository that needs one package."""
     wanted = resolving.parse_requirement(name, "line 1 of requirements.txt")
     return PackageRequest("requirements.txt", (wanted,), **fields)
 

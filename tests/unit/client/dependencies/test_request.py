@@ -32,7 +32,6 @@ NUMPY = metadata.version("numpy")
 
 
 def declares(*lines: str, python: str = "") -> PackageRequest:
-    """What a requirements.txt of these lines declares."""
     wanted = (
         parse_requirement(line, f"line {n} of requirements.txt")
         for n, line in enumerate(lines, start=1)
@@ -221,7 +220,6 @@ def test_shims_of_pyenv_are_not_started(
 def test_a_missing_module_has_one_cure(
     tmp_path: Path, place: str, choice: Any, python: Any, own: bool, said: str
 ) -> None:
-    """It depends on the place, and what the repository declares is told."""
     found = snapshot(tmp_path, "numpy>=1\n")
     text = MissingModule(found, place, choice.where, python, own).advice()
     assert said in text

@@ -41,7 +41,6 @@ def source_distribution(folder: Path, name: str, version: str, built: Path) -> s
 
 @pytest.fixture
 def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Source]:
-    """What a builder was handed, whose wheels need more from the index."""
     seen: list[Source] = []
     needs = {
         "only-source": ["deeper-source"],
@@ -158,7 +157,6 @@ def test_a_repository_becomes_the_version_of_its_wheel(index: Index, built: list
     ],
 )
 def test_nothing_else_is_a_repository(url: str) -> None:
-    """No other protocol, no login, no option, and no empty revision."""
     with refused_dependency("requirement"):
         parse_requirement(f"a @ {url}", "line 1")
     good = parse_requirement("a @ git+https://git.example/a", "line 1")
@@ -174,7 +172,6 @@ CUDA = Lock("torch==2.5 \\\n    --hash=sha256:00\nnvidia-cublas==1 \\\n    --has
 
 @pytest.fixture
 def cuda(index: Index) -> Path:
-    """An index whose torch needs packages of NVIDIA's."""
     make_wheel(index.folder, "vision", requires=["torch", "torchvision"])
     make_wheel(index.folder, "torch", "2.5", requires=["nvidia-cublas"])
     make_wheel(index.folder, "torchvision", "0.20", requires=["torch==2.5"])

@@ -34,7 +34,6 @@ HERE = Target(python=os.path.realpath(sys.executable))
 
 
 def resolve(*lines: str, target: Target = HERE, **options: Any) -> Lock:
-    """The lock for these lines of a requirements.txt."""
     wanted = [
         parse_requirement(line, f"line {n} of requirements.txt")
         for n, line in enumerate(lines, start=1)
@@ -46,7 +45,6 @@ def resolve(*lines: str, target: Target = HERE, **options: Any) -> Lock:
 
 
 def test_every_package_has_its_version_and_hashes(index: Index) -> None:
-    """Those of the repository, theirs, and what the worker imports."""
     make_wheel(index.folder, "wanted", requires=["its-own>=2"])
     make_wheel(index.folder, "its-own", "2.5")
     lock = resolve("wanted")
@@ -274,8 +272,6 @@ def test_without_a_uv_that_can_be_used_the_error_says_how_to_get_one(
 
 @pytest.fixture
 def another_uv(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str], None]:
-    """Puts a script of these lines of Python in uv's place."""
-
     def replace(lines: str) -> None:
         version = "if sys.argv[1] == '--version': sys.exit(print('uv 99.0.0'))"
         (tmp_path / "uv").write_text(f"#!{sys.executable}\nimport sys, time\n{version}\n{lines}\n")
@@ -384,7 +380,6 @@ def test_a_relative_path_is_relative_to_the_users_folder(
 
 
 def test_pips_files_are_read_in_pips_order(tmp_path: Path) -> None:
-    """The user's wins over the machine's, and a variable over both."""
     config, home = tmp_path / "xdg", tmp_path / "home"
     for folder, name in ((config / "pip", "machine"), (home / ".config/pip", "user")):
         folder.mkdir(parents=True)

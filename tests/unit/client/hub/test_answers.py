@@ -13,13 +13,11 @@ from envhub_sandbox.hub.answers import HostileAnswerError, Kind, bounded_body, g
 
 
 def failed(error: BaseException, *secrets: str) -> answers.HubFailure:
-    """What an exception of the Hub's client means."""
     about = {"repo_type": "space", "repo_id": "owner/name", "endpoint": "https://hub.example"}
     return answers.explain(error, secrets, revision=None, **about)
 
 
 def answered(status: int, **headers: str) -> BaseException:
-    """An exception of an HTTP client."""
     error = type("HTTPStatusError", (Exception,), {})("status")
     named = {name.replace("_", "-"): value for name, value in headers.items()}
     error.response = SimpleNamespace(status_code=status, headers=named)
@@ -35,7 +33,6 @@ def answered(status: int, **headers: str) -> BaseException:
     ],
 )
 def test_what_no_hub_answers_has_a_kind_too(error: BaseException, kind: Kind) -> None:
-    """Whatever is wrapped around it."""
     wrapper = type("LocalEntryNotFoundError", (Exception,), {})("wrapped")
     wrapper.__cause__ = error
     assert [failed(error).kind, failed(wrapper).kind] == [kind, kind]
@@ -75,7 +72,6 @@ def test_dots_in_texts_of_a_generated_document_do_not_count() -> None:
 
 
 def sessions() -> list[tuple[Any, list[Any]]]:
-    """One of httpx and one of requests, with the hooks that each calls with an answer."""
     of_httpx = SimpleNamespace(event_hooks={"response": []})
     of_requests = SimpleNamespace(hooks={"response": []})
     return [(of_httpx, of_httpx.event_hooks), (of_requests, of_requests.hooks)]

@@ -75,7 +75,6 @@ def test_names_that_clash_are_refused(paths: list[str]) -> None:
 
 
 def test_ordinary_names_pass() -> None:
-    """Dots, spaces, other scripts and names that differ by case only are fine."""
     check_listing_names(map(record, [".gitattributes", "A.py", "a.py", "my env/ж.txt", "..a"]), "t")
 
 
@@ -106,7 +105,6 @@ def test_accepted_names_stay_below_the_root(names: list[str]) -> None:
     ],
 )
 def test_every_revision_of_a_reference_can_be_opened(revision: str, found: tuple[str, ...]) -> None:
-    """What no jail's cache can be asked for is left out, and not refused by the worker."""
     asked = HubRef.parse(f"org/repo@{revision}").revision
     snapshot = Snapshot("org/repo", "model", "a" * 40, "env.py", Path("/x"), (), asked)
     [copy] = read_hub_copies(snapshot.hub_copies)

@@ -35,13 +35,11 @@ def folder(tmp_path: Path, snapshot_store: Path) -> Path:
 
 
 def names(snapshot: Snapshot) -> list[str]:
-    """The files of a snapshot, as they lie on disk."""
     found = [p for p in snapshot.root.rglob("*") if not p.is_dir()]
     return sorted(str(path.relative_to(snapshot.root)) for path in found)
 
 
 def test_folder_becomes_a_read_only_copy(folder: Path) -> None:
-    """The snapshot has the folder's files, and later edits of the folder do not reach it."""
     snapshot = local(folder)
     assert (snapshot.repo_id, snapshot.repo_type) == (str(folder), "local")
     assert snapshot.path == "env.py"
@@ -82,7 +80,6 @@ def test_unchanged_content_is_the_same_snapshot(folder: Path) -> None:
 def test_forms_of_a_local_reference(
     folder: Path, monkeypatch: pytest.MonkeyPatch, text: str, path: str
 ) -> None:
-    """A folder, a folder with a path, and a file all name an entry."""
     monkeypatch.chdir(folder.parent)
     monkeypatch.setenv("HOME", str(folder.parent))
     snapshot = local(text.format(folder))
@@ -124,7 +121,6 @@ def test_a_folder_that_is_here_comes_before_the_hub(
 
 @pytest.mark.parametrize("path", ["envs.py", "../my-env/env.py", "/etc/passwd", "sub"])
 def test_missing_entry_lists_the_python_files(folder: Path, path: str) -> None:
-    """And a missing folder the forms that exist."""
     with pytest.raises(RepositoryUnavailableError, match=r"it has 'env\.py', 'sub/other\.py'"):
         local(f"{folder}:{path}")
     with pytest.raises(RepositoryUnavailableError, match=r"no such folder.*'\./folder'"):
@@ -167,7 +163,6 @@ def test_a_virtual_environment_is_left_out_and_said(
 
 @pytest.fixture
 def open_ground() -> Iterator[Path]:
-    """A folder that every user may enter."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
         yield Path(folder)
@@ -184,7 +179,6 @@ for reference in sys.argv[1:]:
 
 @needs("no-userns")  # what it starts is another user's
 def test_what_cannot_be_read_is_left_out_and_said(open_ground: Path) -> None:
-    """One file or folder of another user's is no reason to end."""
     for name, mode in {"env.py": 0o644, "a.txt": 0, "b/x.txt": 0o644, "c.py": 0o644}.items():
         (open_ground / name).parent.mkdir(exist_ok=True)
         (open_ground / name).write_text("import c")
@@ -239,7 +233,6 @@ def test_link_that_leaves_the_folder_is_refused(folder: Path, target: str) -> No
 
 @pytest.mark.parametrize("target", ["gone", "somebody@host.4711", "/gone", "link"])
 def test_a_link_to_nothing_is_left_out_and_said(folder: Path, target: str) -> None:
-    """As editors make one beside a file that has unsaved changes."""
     (folder / "sub" / "link").symlink_to(target)
     here, listing = split_local(str(folder)).listed()
     assert listing.left_out == (("sub/link", "a link to nothing"),)
@@ -248,7 +241,6 @@ def test_a_link_to_nothing_is_left_out_and_said(folder: Path, target: str) -> No
 
 @pytest.mark.parametrize(("target", "said"), [(".", "loop"), ("../sub", "loop"), ("..", "loop")])
 def test_link_without_an_end_is_named(folder: Path, target: str, said: str) -> None:
-    """One that leads to a folder above itself is not followed for ever."""
     (folder / "sub" / "link").symlink_to(target)
     with pytest.raises(SnapshotError, match=said):
         local(folder)

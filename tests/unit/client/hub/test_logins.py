@@ -47,7 +47,6 @@ def make(cfg: Any, **options: Any) -> Any:
 
 
 def recipe() -> Recipe:
-    """How an environment was made, by way of a login."""
     return Recipe(
         make_env=make,
         reference="org/repo@0123",

@@ -191,7 +191,6 @@ def test_refusal_names_the_reference_and_a_fix(text: str, what: str, write: str)
     ],
 )
 def test_token_in_a_url_is_not_repeated(text: str) -> None:
-    """A URL that carries a token is refused, and the error does not show the token."""
     with pytest.raises(HubReferenceError) as caught:
         HubRef.parse(text)
     assert "hf_secret" not in str(caught.value)
@@ -220,7 +219,6 @@ def test_only_a_full_commit_is_pinned(revision: str | None) -> None:
     ],
 )
 def test_reference_that_no_hub_has_cannot_be_built(fields: dict[str, str]) -> None:
-    """The fields are checked however a reference is made, so later code can rely on them."""
     with pytest.raises(HubReferenceError):
         HubRef(**{"repo_id": "org/repo", **fields})
 
@@ -244,7 +242,6 @@ _types = st.sampled_from([None, "model", "space", "dataset"])
 def test_printing_and_parsing_are_inverse(
     owner: str, name: str, revision: str | None, path: str, repo_type: str | None
 ) -> None:
-    """Every reference that can be built is read back from its own text."""
     try:
         ref = HubRef(f"{owner}/{name}", revision, path, repo_type)
     except HubReferenceError:
@@ -254,7 +251,6 @@ def test_printing_and_parsing_are_inverse(
 
 @given(st.text(max_size=40) | st.text(alphabet="ab/@:.\\ ~-spaceshf://\n", max_size=40))
 def test_any_text_is_read_or_refused_with_our_error(text: str) -> None:
-    """No text makes the parser fail in another way, and what it reads reads back."""
     try:
         ref = HubRef.parse(text)
     except HubReferenceError:
@@ -280,7 +276,6 @@ print(heavy & set(sys.modules))
 
 @pytest.mark.parametrize("name", ['x#a"b', "x#a\nb", "x\n--pre#a", "x #a", "x"])
 def test_a_reference_that_was_not_parsed_is_checked_too(name: str) -> None:
-    """What becomes source and a requirement has no quotes, ends of lines or options."""
     with pytest.raises(HubReferenceError):
         HubRef(name, repo_type="pypi")
 

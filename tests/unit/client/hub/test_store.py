@@ -49,7 +49,6 @@ def published(slot: store.Slot) -> store.Slot:
 def test_what_another_puts_there_meanwhile_is_not_damaged(
     published: store.Slot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is not there when its record is read, and is when one asks whether it is."""
     elsewhere, exists = published.home.with_name("elsewhere"), os.path.lexists
     published.home.rename(elsewhere)
 
@@ -83,7 +82,6 @@ def test_published_files_load(slot: store.Slot) -> None:
 def test_tree_is_read_only_and_readable_for_every_user(
     snapshot_store: Path, slot: store.Slot, mask: int
 ) -> None:
-    """Files are 0444, folders 0555, and a worker of another uid can reach them, by any umask."""
     before = os.umask(mask)
     try:
         store.publish(slot, records(), write, {})
@@ -195,7 +193,6 @@ def test_what_is_half_deleted_is_made_again(published: store.Slot, damage: Damag
 def test_touched_but_equal_file_is_hashed_once(
     published: store.Slot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Other times with the same content are accepted after a look, and then remembered."""
     os.utime(published.tree / "env.py")
     hashed: list[str] = []
 
@@ -236,7 +233,6 @@ def test_failing_copy_leaves_nothing(slot: store.Slot) -> None:
 
 
 def test_killed_builder_leaves_nothing_that_is_believed(slot: store.Slot) -> None:
-    """A process that dies in the middle leaves no commit, and its rest is swept up later."""
     code = (
         "import os, sys; from pathlib import Path\n"
         "from tests.unit.client.hub import test_store as t\n"
@@ -260,7 +256,6 @@ def test_killed_builder_leaves_nothing_that_is_believed(slot: store.Slot) -> Non
 
 
 def test_second_builder_keeps_the_first_ones_copy(published: store.Slot) -> None:
-    """Who comes second with the same commit changes nothing and leaves nothing."""
     inode = (published.tree / "env.py").stat().st_ino
     store.publish(published, records(), write, {})
     assert (published.tree / "env.py").stat().st_ino == inode
@@ -270,7 +265,6 @@ def test_second_builder_keeps_the_first_ones_copy(published: store.Slot) -> None
 def test_store_that_cannot_be_made_says_where(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A file in the way of the store is named, with the variable that moves the store."""
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "file" / "cache"))
     slot = store.Slot(store.folder_of("local"), COMMIT, "x")
@@ -291,7 +285,6 @@ def test_store_is_in_the_users_cache_unless_said_otherwise(
 
 
 def test_endpoints_types_and_names_have_places_of_their_own(snapshot_store: Path) -> None:
-    """No two repositories share a folder, whatever their names and hosts look like."""
     keys = [
         ("https://huggingface.co", "model", "a/b"),
         ("https://huggingface.co", "space", "a/b"),

@@ -79,7 +79,6 @@ PYTHON = interpreters.own().path
 
 
 def made(folder: Path, *lines: str, **options: Any) -> LockFile:
-    """The lock of a repository that needs these packages."""
     folder.mkdir(exist_ok=True)
     (folder / "env.py").write_text("")
     (folder / "requirements.txt").write_text("".join(f"{line}\n" for line in lines))

@@ -23,7 +23,6 @@ class _Place(Sandbox):
         self.refuses, self.asked = False, 0
 
     def runs_on(self, runtime: Runtime) -> Runtime:
-        """Something of its own, and a long one."""
         self.asked += 1
         return Runtime(f"tcp://{self.name} {'k' * 64}" if self.name.startswith("far") else "")
 

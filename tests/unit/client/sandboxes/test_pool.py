@@ -70,7 +70,6 @@ def pool() -> Iterator[Pool]:
 
 
 def test_a_dead_one_stays_with_its_users_and_others_get_a_fresh_one(pool: Pool) -> None:
-    """The dead one is ended when its last user gives it back, and the fresh one is not."""
     dead = pool.acquire("key", Server)
     dead.server.runs = False
     fresh = pool.acquire("key", Server)

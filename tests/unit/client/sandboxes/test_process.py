@@ -42,7 +42,6 @@ def server() -> Iterator[LocalServer]:
 
 
 def sleeping(ready: int) -> subprocess.Popen[bytes]:
-    """A process that says at once that it is ready."""
     os.write(ready, b"1")
     return subprocess.Popen(["sleep", "1000"])
 
@@ -137,7 +136,6 @@ def folder(root: Path, name: str, files: dict[str, str], mode: int = 0o700) -> P
 
 
 def found(root: Path) -> set[str]:
-    """Names of the folders that would be removed."""
     return {path.name for path in stale_folders(root)}
 
 
@@ -222,7 +220,6 @@ def test_what_may_be_another_machines_is_removed_by_hand_only(
 def test_a_folder_for_sockets_has_a_short_path(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where that of temporary files is too long another one stands in, if there is one."""
     long = tmp_path / ("x" * 100)
     long.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(long))

@@ -151,8 +151,6 @@ def test_our_key_is_a_text_or_a_file(config: Path) -> None:
 
 @pytest.mark.parametrize("name", ["client.key", "known_hosts"])
 def test_a_file_of_keys_that_cannot_be_read_is_said(config: Path, name: str) -> None:
-    """Odd bytes are no key of anybody's, and what is no file, or a huge one, is not read."""
-
     def read() -> bytes:
         is_ours = name == "client.key"
         return remote_keys.client_key(None) if is_ours else remote_keys.server_key(_ENDPOINT, None)
@@ -182,7 +180,6 @@ def test_a_key_that_was_mistyped_is_not_repeated(config: Path, tmp_path: Path) -
 
 
 def test_a_listing_names_each_file_once(tmp_path: Path) -> None:
-    """By its path, sorted, with its size and hash, however many pieces it has."""
     large = b"x" * (remote_repository.PIECE_BYTES + 1)
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub/b").write_bytes(large)

@@ -104,7 +104,6 @@ def lease() -> Any:
 
 
 def closed(lease: Any, fails: BaseException) -> BaseException:
-    """What a request meets while another thread closes, which does not wait."""
     lease.lifecycle.state, lease.lifecycle.closed = State.CLOSED, True
     return fails
 

@@ -36,7 +36,6 @@ ValueError: no
 
 
 def failed(traceback: str, snapshot: Snapshot = LOCAL, stage: str = "step") -> EnvHubError:
-    """The error that is raised for this traceback."""
     error = raised(m.RaisedException("ValueError", "ValueError", "no", traceback, stage))
     add_author_line(error, snapshot)
     return error
@@ -52,7 +51,6 @@ def notes(error: EnvHubError) -> str:
 )
 @pytest.mark.parametrize("stage", ["step", "make_env"])
 def test_the_authors_last_line_is_in_the_text(snapshot: Snapshot, place: str, stage: str) -> None:
-    """By the name that he knows, and the whole traceback is in the notes, by these names too."""
     error = failed(TRACE, snapshot, stage)
     last = f"  File {place.format('lib/a.py')}, line 2, in helper\n    return np.linalg.inv(x)"
     assert str(error).endswith(f"ValueError: no\n{last}")
@@ -128,7 +126,6 @@ HOSTILE = "\x1b]0;owned\x07\x1b[2J\r\u202e"
 )
 @pytest.mark.parametrize("stage", ["step", "import"])
 def test_hostile_tracebacks_stay_bounded_and_printable(trace: str, stage: str) -> None:
-    """Nothing that a terminal obeys, and no more than a screen in the text itself."""
     folder = Snapshot(f"/home/{HOSTILE}", "local", "local-1", "env.py", Path(ROOT), FILES)
     error = failed(trace, stage=stage)
     for text in (str(error), notes(error)):
@@ -144,7 +141,6 @@ def test_hostile_tracebacks_stay_bounded_and_printable(trace: str, stage: str) -
 
 
 def a_failure(folder: Path, source: str) -> m.RaisedException:
-    """What a runner says of a file that raises when it is run."""
     path = folder / "env.py"
     path.write_text(source)
     try:
@@ -252,7 +248,6 @@ def test_others_get_none(kind: str, message: str, network: str) -> None:
 
 
 def test_of_a_death_only_the_display_is_read() -> None:
-    """A process that exits by itself after such words, and one that is ended, are told apart."""
     said = "qt.qpa.xcb: could not connect to display \nThis application failed to start"
     for signal, added in (("SIGABRT", True), ("SIGKILL", False)):
         error = WorkerDiedError("died", signal=signal, reason="signal", log_tail=said)

@@ -59,7 +59,6 @@ def test_each_state_has_its_refusal(state: State, kind: type[Exception], said: s
 
 
 def test_backoff_doubles_and_is_bounded() -> None:
-    """The first restart is at once, those right after it wait longer and longer."""
     assert [backoff_s(0.1, n) for n in range(5)] == [0.0, 0.1, 0.2, 0.4, 0.8]
     assert backoff_s(0.1, 10_000) == 30.0
     assert backoff_s(0.0, 10_000) == 0.0

@@ -23,7 +23,6 @@ ACTIONS = np.array([0, 1])
 
 @pytest.fixture
 def lanes() -> list[FakeLane]:
-    """To two workers with a sub-environment each."""
     lanes = [FakeLane(1), FakeLane(1)]
     for row, lane in enumerate(lanes):
         lane.answer = m.Value((row,))

@@ -35,7 +35,6 @@ def actions_of(kept: History) -> list[Any]:
 
 
 def test_what_outlives_a_reset_is_bounded() -> None:
-    """A program that calls with another argument after each step fills nothing."""
     kept = History(10_000)
     for number in range(1000):
         ask(kept, m.Call(0, "f", (number,), {}))
@@ -90,7 +89,6 @@ def test_requests_come_back_in_order() -> None:
 
 
 def test_the_caller_may_change_his_actions() -> None:
-    """What was sent is kept, whatever becomes of the array, the mapping or the options."""
     kept, array, options = History(100), np.array([1, 2]), {"b": [1]}
     for actions in (array, {"a": array}, [array.view(np.matrix)], np.array([array, None], object)):
         kept.step(actions)
@@ -104,7 +102,6 @@ def test_the_caller_may_change_his_actions() -> None:
 
 
 def test_a_reset_that_seeds_all_begins_anew() -> None:
-    """One without seeds, or of some sub-environments only, goes on."""
     kept = History(100)
     reset(kept)
     kept.step(np.array([1, 1]))
@@ -157,7 +154,6 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch, actions: Any) -> Non
 
 
 def test_a_fresh_process_begins_anew() -> None:
-    """Also where a worker of a fleet is fresh. A fleet records each step itself."""
     kept = History(100)
     part = kept.of_part()
     for owner in (kept, part):

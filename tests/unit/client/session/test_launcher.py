@@ -75,7 +75,6 @@ def place() -> _Place:
 
 @pytest.fixture
 def launcher(client: _Client, place: _Place) -> Launcher:
-    """Of a repository whose denials are recorded."""
     repository = session_over(FakeLane()).repository
     repository.policy = type(repository.policy)(record_denials=True)
     repository.runtime = cast("Any", SimpleNamespace(python="", packages=""))
@@ -147,7 +146,6 @@ def test_the_status_of_its_own_jail_is_found(
 def test_denials_are_asked_for_where_the_server_can_know(
     launcher: Launcher, client: _Client, reason: Any, asked: int
 ) -> None:
-    """Once for each error, and not of a server that has gone itself."""
     client.status = ({"jail": 7, "denied": ("ptrace",)},)
     error = WorkerDiedError("it died", reason=reason)
     for _ in range(2):
@@ -214,7 +212,6 @@ def asked(*answers: EnvHubError, retry_s: float = 60.0, **deadline: Any) -> int:
 
 @pytest.mark.parametrize("answers", [(), (_FULL,), (_FULL, _FULL), (_ENDING, _GONE, _GONE)])
 def test_it_is_asked_until_there_is_room(answers: tuple[EnvHubError, ...]) -> None:
-    """Also where the server ends, and another is about to stand in its place."""
     assert asked(*answers) == len(answers) + 1
 
 
@@ -254,7 +251,6 @@ def opener() -> Any:
 
 
 def test_it_is_opened_once_and_ends_with_its_last_user(opener: Any) -> None:
-    """One that was provided ends so too, or by the close of its suite, once, if nobody uses it."""
     source = SharedJail(opener, lambda: None)
     source.provide(loaded())
     user = source.take(Deadline(None))

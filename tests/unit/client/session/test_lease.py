@@ -31,7 +31,6 @@ class _Jails:
         self.built = 0
 
     def do(self, what: str) -> None:
-        """Note it, and fail where it is to fail."""
         self.done.append(what)
         if self.fails.get(what):
             raise self.fails[what].pop()
@@ -49,7 +48,6 @@ class _Jails:
 
 @pytest.fixture
 def taken(monkeypatch: pytest.MonkeyPatch) -> tuple[Lease, _Jails]:
-    """The lease of an environment that has no jail yet, and where it gets one."""
     lane = FakeLane()
     session = session_over(lane)
     hold = SimpleNamespace(enter=lambda: lambda: None, settle=lambda: False)
@@ -186,7 +184,6 @@ class _Task:
 
 
 def suite_of(count: int, ahead: int | None = 1) -> list[_Task]:
-    """Tasks, of which so many are started ahead."""
     tasks = [_Task() for _ in range(count)]
     SuitePrewarm([[[cast("Prewarm", task)] for task in tasks]], ahead)
     return tasks

@@ -42,7 +42,6 @@ class Told:
 
 
 def jail(reply: m.Message, *parts: m.Message, kept: bool = True) -> JailHandle:
-    """A jail of two runners whose server says this."""
     client = cast("WorkerConnection", Told(reply, *parts))
     made = JailHandle(client, 1, [1, 2], [], DEFAULT_LIMITS)
     made.kept = kept

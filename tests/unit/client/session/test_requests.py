@@ -74,7 +74,6 @@ def test_what_is_sent_instead_is_not_what_is_kept(session: EnvSession, lane: Fak
 def test_another_message_than_was_asked_for_gives_the_worker_up(
     session: EnvSession, lane: FakeLane
 ) -> None:
-    """Of two kinds either is taken."""
     for lane.answer in (m.Value(1), m.Method()):
         assert session.requests.ask_own("name", m.GetOwn, "name") == lane.answer
     lane.answer = m.ResetDone(0, {})

@@ -20,7 +20,6 @@ ACTIONS = np.zeros(1, np.int64)
 
 @pytest.fixture
 def lane() -> FakeLane:
-    """To a worker that has the second of two sub-environments."""
     return FakeLane(1)
 
 

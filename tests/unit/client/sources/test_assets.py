@@ -39,7 +39,6 @@ def declared(folder: Path, text: str) -> list[str]:
     ],
 )
 def test_most_cards_declare_nothing(tmp_path: Path, text: str) -> None:
-    """No card, none in front, none of ours, and one that does not end."""
     assert declared(tmp_path, text) == []
 
 
@@ -101,7 +100,6 @@ def hub(stub_hub: StubHub, hub_cache: Path) -> dict[str, Any]:
 
 
 def own(stub_hub: StubHub, hub: dict[str, Any], *declared: str) -> Snapshot:
-    """The environment's own files, with a card."""
     card = CARD.format(", ".join(declared))
     stub_hub.add("org/repo", {"env.py": "", "README.md": card if declared else "none"})
     return fetch(HubRef.parse("models/org/repo"), **hub)

@@ -32,7 +32,6 @@ def repository(tmp_path: Path, snapshot_store: Path) -> GitRepository:
 
 
 def files(folder: Path) -> dict[str, str]:
-    """What the snapshot of a folder holds."""
     root = local(folder).root
     return {str(p.relative_to(root)): p.read_text() for p in root.rglob("*") if p.is_file()}
 
@@ -171,7 +170,6 @@ def test_conversions_by_git_are_named(repository: GitRepository) -> None:
 
 
 def test_a_folder_in_a_checkout_is_a_part_of_it(repository: GitRepository) -> None:
-    """By the rules of the whole, unless these leave out all of it."""
     (repository.folder / ".gitignore").write_text("*.log\nbuild/\n")
     for name in ("envs/env.py", "envs/a.log", "build/env.py", "build/b.log"):
         (repository.folder / name).parent.mkdir(exist_ok=True)

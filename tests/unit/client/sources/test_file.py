@@ -16,7 +16,6 @@ needs_git = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
 
 @pytest.fixture
 def folder(tmp_path: Path, snapshot_store: Path) -> Path:
-    """One with a file in it, and with much that is not the file's."""
     made = tmp_path / "downloads"
     write(made, "env.py", "tax.pdf", ".env", ".ssh/id_rsa", "other.py", "pictures/a.png")
     return made
@@ -29,7 +28,6 @@ def write(folder: Path, *names: str, **texts: str) -> None:
 
 
 def shown(reference: object) -> set[str]:
-    """What the code of a reference sees, as it lies on disk."""
     snapshot = local(str(reference))
     found = {p.relative_to(snapshot.root).as_posix() for p in snapshot.root.rglob("*")}
     files = {record.path for record in snapshot.files}
@@ -66,7 +64,6 @@ def test_its_modules_and_packages_are_its_own(
 
 
 def test_imports_are_followed(folder: Path) -> None:
-    """Through modules, through a package's own files, and round in a circle."""
     texts = {"env.py": "import a", "a.py": "from p.q import r", "p/q.py": "import c, a"}
     write(folder, "p/__init__.py", "p/data.bin", "c/d.py", "c/__init__.py", "z.py", **texts)
     own = {"p/__init__.py", "p/data.bin", "c/__init__.py", "c/d.py"}

@@ -47,7 +47,6 @@ def serve(monkeypatch: pytest.MonkeyPatch) -> dict[str, bytes]:
 
 
 def read(tmp_path: Path) -> dict[str, bytes]:
-    """All files, copied as the store does it."""
     found = {}
     with HOST.files(REPO, COMMIT) as files:
         records = list(files.listing)

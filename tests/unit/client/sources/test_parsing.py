@@ -35,7 +35,6 @@ def make_env(n_envs=1, use_async_envs=False):
 
 
 def imported(folder: Path) -> set[tuple[str, str]]:
-    """Names, and the files in which they stand."""
     return {(one.name, one.file) for one in imports(local(folder))}
 
 
@@ -45,7 +44,6 @@ def imports(snapshot: Snapshot) -> list[source.Import]:
 
 
 def test_imports_are_followed_through_the_repository(tmp_path: Path) -> None:
-    """Its own modules are no packages, and what nobody imports is not read."""
     folder = write_repository(tmp_path / "r", _ENTRY)
     (folder / "helper.py").write_text("import helpers_need")
     (folder / "unused.py").write_text("import nobody_needs")

@@ -91,7 +91,6 @@ def _publish(slot: store.Slot, content: bytes) -> None:
 
 
 def _above(path: Path) -> list[Path]:
-    """The folder that the store lies in, and the store's own."""
     return [path.parent, path, path / "snapshots", path / "snapshots" / "local"]
 
 
@@ -169,7 +168,6 @@ def test_sticky_folder_above_the_store_is_no_reason(snapshot_store: Path, slot: 
 def test_links_are_followed_step_by_step(
     tmp_path: Path, snapshot_store: Path, slot: store.Slot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A store behind links is as good as the folders that they go through, and no better."""
     (tmp_path / "open" / "x").mkdir(parents=True)
     (tmp_path / "open" / "store").symlink_to(f"../{snapshot_store.name}/.")
     (tmp_path / "link").symlink_to(tmp_path / "open" / "x" / ".." / "store")
@@ -251,7 +249,6 @@ def as_somebody(act: Callable[[], object]) -> None:
 
 
 def test_nobody_gets_at_a_snapshot_before_it_is_complete(snapshot_store: Path) -> None:
-    """While its files have the umask's modes, their folder is ours alone."""
     made, seen = store.Slot(store.folder_of("local"), COMMIT, "x"), []
 
     def copy(_: FileRecord, target: Path) -> None:
@@ -279,7 +276,6 @@ def test_a_file_is_replaced_and_nothing_stays_beside_it(tmp_path: Path) -> None:
 
 
 def test_a_text_is_kept_and_recalled(tmp_path: Path) -> None:
-    """A folder that is open to others, a file that is no text and one that is absent are none."""
     folder = tmp_path / "texts"
     assert folders.recall(folder, "key") is None
     folders.keep(folder, "key", "é")

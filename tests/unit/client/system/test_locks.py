@@ -138,7 +138,6 @@ def test_what_several_share_none_has_alone(tmp_path: Path) -> None:
 
 
 def test_a_shared_lock_ends_with_its_object_and_not_with_a_fork(tmp_path: Path) -> None:
-    """A fork that ends gives nothing back, and one that stays holds nothing."""
     path = tmp_path / "record"
     path.touch()
     lock = SharedLock(path)

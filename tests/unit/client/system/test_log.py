@@ -17,7 +17,6 @@ def test_loggers_are_ours_and_silent() -> None:
 
 
 def test_each_line_is_logged_and_shown(caplog: pytest.LogCaptureFixture) -> None:
-    """By whoever has the terminal, the latest first, in a line that fits."""
     outer, inner = list[str](), list[str]()
     with caplog.at_level(logging.INFO, log.DEPENDENCIES.name):
         with log.progress_shown_by(outer.append):

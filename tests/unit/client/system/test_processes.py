@@ -59,7 +59,6 @@ time.sleep(3600)
 
 @contextlib.contextmanager
 def family(how: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], list[psutil.Process]]]:
-    """A parent, and who was started by it and below that."""
     command = [sys.executable, "-I", "-c", _PARENT, how, _CHILD]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder) as parent:
         below = [psutil.Process(int(word)) for word in parent.stdout.readline().split()]
@@ -122,8 +121,6 @@ def test_calls_run_at_the_same_time() -> None:
 
 
 def test_each_keeps_its_own_failure() -> None:
-    """It is raised when its result is asked for, and ends no other."""
-
     def fails() -> int:
         raise ValueError("this one")
 
@@ -166,7 +163,6 @@ def test_a_wait_may_end_before_the_calls() -> None:
 
 
 def test_a_program_of_ours_is_this_code_and_need_not_be_installed(tmp_path: Path) -> None:
-    """A checkout, here links to one, is found by a variable, which a program of ours ignores."""
     for package in (envhub_sandbox, envhub_worker):
         (tmp_path / package.__name__).symlink_to(Path(package.__file__).parent)
     (tmp_path / "told.py").write_text(

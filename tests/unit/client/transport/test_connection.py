@@ -62,7 +62,6 @@ def test_what_another_has_reaped_ended_somehow() -> None:
 
 @contextmanager
 def connected() -> Iterator[tuple[LyingServer, WorkerConnection]]:
-    """A server that can be made to lie, and a connection to it."""
     with lying() as server:
         connection = WorkerConnection(server.endpoint, server.process_fd)
         try:
@@ -182,7 +181,6 @@ def test_the_end_of_a_server_has_arrived_as_well() -> None:
 
 
 def test_the_log_names_each_message(caplog: pytest.LogCaptureFixture) -> None:
-    """Both ways, and no value of them."""
     caplog.set_level("DEBUG", "envhub_sandbox.messages")
     with lying() as server:
         client = WorkerConnection(server.endpoint, server.process_fd)

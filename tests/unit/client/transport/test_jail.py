@@ -22,7 +22,6 @@ REPLY = m.pack(m.Value(1))
 
 
 def test_what_has_changed_is_no_longer_known() -> None:
-    """The others are, and the reply's own frames are as they were."""
     cache = WatchedAttributes()
     for name in ("task", "size"):
         assert cache.note(7, name, ("a", None))

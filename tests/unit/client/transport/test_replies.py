@@ -19,7 +19,6 @@ ESCAPE = "\x1b]0;owned\x07\x1b[2J\r"
 
 
 def a_raised(**changed: str) -> m.RaisedException:
-    """What a runner says about an exception, with some fields changed."""
     fields = {
         "builtin": "ValueError",
         "type_name": "mypkg.Oops",
@@ -191,7 +190,6 @@ SERVERS = [
 
 @pytest.mark.parametrize("message", SERVERS, ids=lambda message: type(message).__name__)
 def test_a_runner_cannot_speak_in_the_servers_name(message: m.Message) -> None:
-    """A death or a refusal inside a runner's reply is a broken rule, not news."""
     with pytest.raises(errors.RemoteProtocolError, match="a runner sent") as caught:
         check_reply(message)
     assert "\x1b" not in str(caught.value)
@@ -214,7 +212,6 @@ def test_the_kinds_of_both_conversations_are_apart() -> None:
     ],
 )
 def test_deaths_say_how(reply: m.Death, text: str) -> None:
-    """Exit code or signal, the request that was being served, and the last output."""
     error = death(reply)
     assert text in str(error)
     told = (error.exit_code, error.signal, error.reason, error.log_tail, error.request)
@@ -257,7 +254,6 @@ def test_other_replies_than_expected_break_the_rules() -> None:
 
 
 def test_every_reason_of_a_death_is_told() -> None:
-    """In the public docstring, and in words wherever the server gives it."""
     attributes = str(errors.WorkerDiedError.__doc__)
     told = attributes.partition("reason:")[2].partition("log_tail:")[0]
     assert re.findall(r'``"([a-z-]+)"``', told) == list(REASONS)

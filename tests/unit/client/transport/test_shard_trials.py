@@ -172,7 +172,6 @@ def test_what_is_no_time_or_no_choice_is_not_remembered(
 def test_only_what_changes_nothing_is_left_to_speed(
     path: Path, changes: dict[str, Any], apart: bool, processes: int
 ) -> None:
-    """A process each, unless they are independent, and have not been found to share something."""
     env, trials = environment(16, **changes), ShardTrials(path, apart=apart)
     assert len(trials.bounds_for(env, None)) == processes
     assert len(trials.bounds_for(env, 3)) == 3

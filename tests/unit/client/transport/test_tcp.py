@@ -42,7 +42,6 @@ def hangs_up(listener: socket.socket) -> None:
 
 
 def test_a_server_that_restarts_is_waited_for() -> None:
-    """The handshake that it ended is followed by one that succeeds."""
     far = TcpServer(_PUBLIC, z85.decode(_SECRET))
     listener = socket.create_server(("127.0.0.1", 0))
     port = listener.getsockname()[1]

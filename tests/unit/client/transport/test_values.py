@@ -43,7 +43,6 @@ BITS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 
 
 def arrived(value: object, limits: WireLimits = DEFAULT_LIMITS) -> Any:
-    """What a client makes of a worker's answer."""
     frames = m.pack(m.Value(value), describer=described)
     message = m.unpack(frames, limits=limits, things=DescriptionReader)
     assert isinstance(message, m.Value)
@@ -79,7 +78,6 @@ def test_what_only_its_owner_knows_is_told() -> None:
 
 @pytest.mark.parametrize("bits", BITS)
 def test_generators_arrive(bits: str) -> None:
-    """They go on where the worker's stand, and are the caller's own."""
     original = np.random.Generator(getattr(np.random, bits)(3))
     original.integers(0, 9, 5, np.int32)
     found = arrived((original, None))[0]
@@ -127,7 +125,6 @@ REPLY = m.pack(m.Value(1))
 
 
 def told(heard: RemoteWarnings, *some: tuple[str, str]) -> list[Any]:
-    """What the caller is told after a reply with these."""
     if some:
         assert heard.take(WARNINGS.put(some, REPLY)) == REPLY
     with warnings.catch_warnings(record=True) as shown:
@@ -154,7 +151,6 @@ def test_each_is_told_once() -> None:
 
 
 def test_a_flood_ends_with_a_word() -> None:
-    """Who has more than so many different ones is not listened to any more."""
     heard, shown = RemoteWarnings(), []
     for number in range(3 * MOST):
         shown += told(heard, ("UserWarning", str(number)))
@@ -177,7 +173,6 @@ def test_what_the_filters_raise_leaves_the_rest() -> None:
 def test_a_torch_that_cannot_be_imported_is_not_the_workers_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A tensor is made by the caller's own torch, which the worker did not break."""
     torch = pytest.importorskip("torch")
     frames = m.pack(m.Value(torch.zeros(2)))
     (tmp_path / "torch.py").write_text("raise RuntimeError('another numpy')")

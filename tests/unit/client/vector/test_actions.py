@@ -77,7 +77,6 @@ def test_lists_tuples_and_other_dtypes_are_taken(
 
 @pytest.mark.parametrize("name", sorted({*SINGLE_SPACES} - {"discrete", "dict", "tuple"}))
 def test_without_a_count_the_space_is_that_of_the_whole_batch(name: str) -> None:
-    """A vector environment whose action space is no batch of its single one."""
     space = SINGLE_SPACES[name]
     sample = space.sample()
     assert_same(sample, batch_of(space, sample, None))
@@ -113,15 +112,12 @@ def test_tensors_are_taken() -> None:
 def test_other_shapes_dtypes_and_structures_are_refused(
     space: gym.Space[Any], value: Any, complaint: str
 ) -> None:
-    """The error names the place, what belongs there, and what was given."""
     with pytest.raises(ActionError, match=complaint) as caught:
         batch_of(space, value, 2)
     assert isinstance(caught.value, ValueError)
 
 
 def test_objects_that_fail_to_be_arrays_are_refused() -> None:
-    """Whatever their own code raises, it is a clear error, with the cause kept."""
-
     class Broken:
         def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
             raise OSError("no")

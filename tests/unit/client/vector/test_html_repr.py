@@ -49,7 +49,6 @@ def test_a_box_is_shown_without_the_spaces_that_align_it() -> None:
 
 
 def test_spaces_and_layers_are_shown() -> None:
-    """Of several workers' layers those that hold in all of them."""
     held = [("seccomp", True), ("cgroup", False), ("seccomp", True), ("cgroup", True)]
     layers = [{"layer": name, "enforced": holds} for name, holds in held]
     text = Tags(environment_html(an_env(), layers)).text

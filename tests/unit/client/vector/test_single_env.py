@@ -68,7 +68,6 @@ class _Echo(gym.Env[Any, Any]):
 
 @pytest.mark.parametrize("space", _SPACES, ids=str)
 def test_actions_and_observations_are_of_the_single_spaces(space: spaces.Space[Any]) -> None:
-    """One action becomes a batch of one, and a batch of one an observation."""
     env = SingleEnv(SyncVectorEnv([lambda: _Echo(space)]))
     env.reset()
     env.action_space.seed(3)
@@ -149,7 +148,6 @@ class _Liar(VectorEnv[Any, Any, Any]):
     ids=str,
 )
 def test_results_that_are_of_nobody_break_the_rules(lies: Any) -> None:
-    """Whatever is wrong with them, it is an error of this project."""
     env = SingleEnv(_Liar(**lies))
     with pytest.raises(RemoteProtocolError):
         env.step(1)

@@ -22,8 +22,6 @@ class _Counted(gym.Env[Any, Any]):
 
 
 def suites(closed: list[str]) -> EnvSuites:
-    """Two suites, three tasks, of which one is named by text."""
-
     def made(name: str) -> Any:
         return SyncVectorEnv([lambda: _Counted(name, closed)])
 
@@ -120,7 +118,6 @@ def _suites(count: int) -> dict[str, dict[Any, Any]]:
 
 @pytest.mark.parametrize("live", [1, 2, 3, 40])
 def test_no_more_live_than_were_asked_for(live: int) -> None:
-    """Of those that do, one is the next, which was started ahead of its turn."""
     ahead: list[str] = []
 
     def play(suite: str, task: Any, env: Any) -> str:

@@ -45,7 +45,6 @@ def ask_by_another(error: BaseException) -> None:
 
 
 def frames(error: BaseException, asking: Callable[..., None] = ask) -> list[str]:
-    """The functions in the traceback that a caller sees, below his own."""
     with pytest.raises(type(error)) as caught:
         asking(error)
     assert caught.value is error
@@ -66,7 +65,6 @@ def frames(error: BaseException, asking: Callable[..., None] = ask) -> list[str]
 )
 @pytest.mark.parametrize("asking", [ask, ask_by_another])
 def test_one_frame_of_ours_is_left(error: EnvHubError, asking: Callable[..., None]) -> None:
-    """Which pytest hides, and whose line says how to see the others."""
     assert frames(error, asking) == ["asked"]
     last = error.__traceback__.tb_next
     assert last.tb_frame.f_locals["__tracebackhide__"] is True

@@ -76,7 +76,6 @@ class _Runner:
 
 
 def ask(lane: LaneShard, dtype: str, slot: int) -> None:
-    """Ask for a step."""
     lane.write([np.zeros(1, dtype)], (slot, 0, 0))
 
 

@@ -50,7 +50,6 @@ def read(
 
 
 def descriptor(code: int, *shape: int, frame: bool = False, parameter: int | None = None) -> bytes:
-    """A descriptor by its document, independent of the writer."""
     head = bytes((code, len(shape) | (0x80 if frame else 0)))
     middle = b"" if parameter is None else struct.pack("<I", parameter)
     return head + middle + struct.pack(f"<{len(shape)}Q", *shape)
@@ -67,7 +66,6 @@ def descriptor(code: int, *shape: int, frame: bool = False, parameter: int | Non
     order=st.sampled_from("CF"),
 )
 def test_every_dtype_and_shape_arrives_as_it_was(array: np.ndarray[Any, Any], order: Any) -> None:
-    """Values, dtype and shape survive, also of 0-d and empty arrays, in either memory order."""
     assert_same(array, through(np.array(array, order=order)))
 
 
@@ -87,7 +85,6 @@ def test_every_dtype_and_shape_arrives_as_it_was(array: np.ndarray[Any, Any], or
     ],
 )
 def test_layout_and_byte_order_do_not_matter(view: np.ndarray[Any, Any]) -> None:
-    """Views with negative or zero strides, Fortran order and big-endian arrays cross by value."""
     assert_same(view.astype(view.dtype.newbyteorder("=")), through(view))
 
 
@@ -130,7 +127,6 @@ def test_misaligned_frames_give_aligned_arrays() -> None:
     "dtype", [object, "V4", [("a", "f4")], np.longdouble, np.clongdouble, "U300000", "S2000000"]
 )
 def test_dtypes_off_the_list_are_refused_before_sending(dtype: Any) -> None:
-    """Objects, void, structures, long doubles and huge strings raise LocalProtocolError."""
     with pytest.raises(LocalProtocolError):
         ArrayWriter().add(np.zeros(1, dtype))
 
@@ -185,7 +181,6 @@ FRAMED = descriptor(F4, 1, frame=True)
 def test_a_lie_about_an_array_is_refused(
     spoiled: bytes, tail: bytes, frames: tuple[bytes, ...]
 ) -> None:
-    """Wrong lengths, shapes, dtypes and contents raise RemoteProtocolError, whatever they are."""
     with pytest.raises(RemoteProtocolError):
         read(spoiled, tail, frames)
 

@@ -64,7 +64,6 @@ def through(value: object, **options: Any) -> Any:
 
 @given(values)
 def test_nested_values_arrive_with_their_types(value: object) -> None:
-    """Whatever is built of plain values and arrays arrives the same, bit for bit."""
     assert_same(value, through(value))
 
 
@@ -84,7 +83,6 @@ def test_nested_values_arrive_with_their_types(value: object) -> None:
     ids=repr,
 )  # fmt: skip
 def test_corner_values_arrive_with_their_types(value: object) -> None:
-    """Extremes and empties of every kind, elements of object arrays, and the largest depth."""
     assert_same(value, through(value))
 
 
@@ -129,7 +127,6 @@ def test_lone_surrogates_arrive_as_visible_escapes() -> None:
 
 
 def test_large_arrays_are_frames_and_small_ones_are_not() -> None:
-    """Beside the header there is one frame for each large array, in the order of the value."""
     big, small = np.zeros(INLINE_BYTES + 1, np.uint8), np.zeros(4)
     frames = encode({"a": small, "b": [big, small], "c": big[:-1]})
     assert [len(frame) for frame in frames[1:]] == [INLINE_BYTES + 1]
@@ -139,7 +136,6 @@ def test_large_arrays_are_frames_and_small_ones_are_not() -> None:
 
 
 def test_enum_member_arrives_as_inert_name_and_value() -> None:
-    """Members of enumerations arrive as text, with the value decoded, and can be keys."""
     red = through(Colour.RED)
     assert isinstance(red, RemoteEnum)
     assert (red.type_name, red.text) == (f"{__name__}.Colour", "RED")
@@ -149,7 +145,6 @@ def test_enum_member_arrives_as_inert_name_and_value() -> None:
 
 @pytest.mark.parametrize("value", [object(), Point(1), lambda: 0, sys, int, {}.keys()])
 def test_unknown_objects_arrive_as_their_description(value: object) -> None:
-    """Objects, dataclasses, functions, modules and classes arrive as type name and repr."""
     remote = through(value)
     assert isinstance(remote, RemoteObject)
     assert remote.type_name.endswith(type(value).__qualname__)
@@ -220,7 +215,6 @@ def test_arrays_of_other_libraries_arrive_as_numpy_arrays() -> None:
 
 
 def test_torch_tensors_arrive_as_tensors_or_arrays() -> None:
-    """Tensors of every dtype cross, also with gradients, conjugated, 0-d or bfloat16."""
     torch = pytest.importorskip("torch")
     source = [
         torch.arange(6.0, requires_grad=True).reshape(2, 3),
@@ -262,7 +256,6 @@ def cyclic() -> dict[str, Any]:
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_what_cannot_be_sent_is_refused_with_its_path(value: object, text: str) -> None:
-    """Cycles, depth, dtypes and sizes raise LocalProtocolError that names the offender."""
     with pytest.raises(LocalProtocolError, match=text):
         encode(value)
 

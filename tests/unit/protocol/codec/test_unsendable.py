@@ -154,7 +154,6 @@ def test_what_cannot_be_sent_is_named(message: m.Message, words: str) -> None:
     ids=["structured", "one of it", "raw", "raws", "long double", "complex long doubles"],
 )
 def test_what_numpy_alone_has_arrives_as_plain_values(sent: object, arrives: object) -> None:
-    """Structured elements as tuples, raw ones as bytes, long doubles as doubles."""
     assert_same(arrives, decode(encode(sent)))
 
 

@@ -30,7 +30,6 @@ ACTION = spaces.Discrete(3, start=1)
 
 
 def an_env(**changed: Any) -> EnvManifest:
-    """A manifest of one environment, with some fields changed."""
     facts: dict[str, Any] = {
         "suite": "libero",
         "metadata": {"render_fps": 30, "render_modes": ["rgb_array"]},
@@ -51,7 +50,6 @@ def a_manifest(*envs: EnvManifest) -> Manifest:
 
 
 def value_of(manifest: Manifest | None = None) -> Any:
-    """The plain value of a manifest, as it comes off the wire."""
     return decode(encode(encode_manifest(manifest or a_manifest())))
 
 
@@ -63,7 +61,6 @@ def with_env(name: str, value: object) -> Any:
 
 
 def read(value: object) -> Manifest:
-    """What the client makes of a manifest."""
     return decode_manifest(value, max_elements=ELEMENTS)
 
 

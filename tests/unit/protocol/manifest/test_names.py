@@ -192,7 +192,6 @@ def test_states_with_another_field_are_refused_or_harmless(kind: str, data: st.D
 
 @pytest.mark.parametrize("value", [RemoteObject("a.B", "<b>"), RemoteEnum("a.E", "X", [3])])
 def test_stand_ins_are_plain_values(value: RemoteObject) -> None:
-    """They copy, pickle, hash and print, are one object to numpy, and have nothing of the peer."""
     assert copy.deepcopy(value) == copy.copy(value) == pickle.loads(pickle.dumps(value)) == value
     assert hash(copy.deepcopy(value)) == hash(value)
     assert np.asarray(value).item() is value
@@ -227,7 +226,6 @@ def test_remote_errors_are_their_builtin_but_for_what_a_caller_would_miss() -> N
 
 
 def test_the_proxys_own_names_are_never_served() -> None:
-    """Its methods and properties are found in the class, and its fields mean nothing outside."""
     own = {**vars(SandboxVectorEnv), **vars(SendRecv)}
     public = [name for name in own if not name.startswith("_")]
     beyond = {name for name in public if not hasattr(AsyncVectorEnv, name) and is_servable(name)}

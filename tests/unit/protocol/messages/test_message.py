@@ -38,7 +38,6 @@ def no_forms(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def changed(value: Any) -> Any:
-    """The same with other numbers and texts."""
     if type(value) in (int, float, np.float32):
         return -1 - value
     if type(value) is str:
@@ -108,7 +107,6 @@ def test_what_can_be_changed_of_a_recurring_message_is_the_receivers_own() -> No
 
 
 def _known(value: object) -> bytes:
-    """The header of a message whose form both sides know."""
     for _ in range(3):
         frames = m.pack(m.Value(value))
         m.unpack(frames)
@@ -179,7 +177,6 @@ def test_a_peer_that_never_repeats_itself_fills_nothing() -> None:
     ("number", "size", "times"), [(10_000, 5, 1), (3_000, 5, 2), (20, 1 << 17, 2)]
 )
 def test_what_is_kept_of_a_peers_messages_has_a_bound(number: int, size: int, times: int) -> None:
-    """However many of them come, come again, or are large."""
     tracemalloc.start()
     for index in range(number):
         frames = wire.value(msgpack.packb(f"{index:{size}}"))

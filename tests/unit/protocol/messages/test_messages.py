@@ -167,7 +167,6 @@ def test_a_header_is_never_taken_for_packed(number: int) -> None:
     ],
 )
 def test_what_is_no_message_is_refused(value: object, complaint: str) -> None:
-    """A kind, a count of fields or a type that does not fit is the peer's fault."""
     with pytest.raises(RemoteProtocolError, match=complaint):
         m.unpack(encode(value))
 

@@ -23,7 +23,6 @@ CHANGE = (1, "task")
 
 
 def warned(*things: object) -> Buffer:
-    """What stands in front of a reply, whatever it holds."""
     return m.pack(m.Warnings(tuple(things)))[0]
 
 

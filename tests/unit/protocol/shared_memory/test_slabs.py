@@ -64,7 +64,6 @@ def test_nothing_in_a_slab_overlaps(space: gym.Space[Any], count: int) -> None:
 
 @pytest.mark.parametrize("space", FIXED, ids=str)
 def test_a_batch_survives_its_leaves(space: gym.Space[Any]) -> None:
-    """Written leaf by leaf into a slot and assembled again, a batch is what it was."""
     layout = slabs.observation_layout(space, 3, 2)
     assert layout is not None
     batched = batch_space(space, 3)

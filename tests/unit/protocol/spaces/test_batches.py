@@ -46,7 +46,6 @@ def batch_of(space: gym.Space[Any], count: int, seed: int = 0) -> tuple[list[Any
 
 
 def parts_of(space: gym.Space[Any], members: list[Any], bounds: batches.Bounds) -> list[Any]:
-    """What the shards of a vector environment would each answer."""
     return [
         concatenate(space, members[start:stop], create_empty_array(space, stop - start))
         for start, stop in bounds
@@ -231,8 +230,6 @@ def test_few_bytes_make_no_large_column() -> None:
 
 
 def test_many_entries_are_each_looked_at_once() -> None:
-    """A worker chooses how many columns of objects it sends, and the client joins each of them."""
-
     class Counted(dict[str, Any]):
         looks = 0
 

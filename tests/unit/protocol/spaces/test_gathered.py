@@ -68,7 +68,6 @@ UNLIKE = st.fixed_dictionaries({}, optional={"one": ANY, "other": ANY})
 @given(st.lists(UNLIKE, min_size=1, max_size=6))
 @example([{"other": {"b": ""}}, {"other": {"a": 0, "b": ""}}, {"other": 0}])
 def test_each_has_its_own_whatever_the_others_say(infos: list[dict[str, Any]]) -> None:
-    """Also where one has a mapping and another an array, and where dtypes differ."""
     each, sizes = [joined([info]) for info in infos], [1] * len(infos)
     gathered = gather_infos(each, sizes, _ROOM)
     for index, info in enumerate(infos):
@@ -138,7 +137,6 @@ _LIES = st.dictionaries(_KEYS, _DEEPER, max_size=5)
 
 @given(st.lists(_LIES, min_size=2, max_size=4))
 def test_nothing_that_is_let_in_keeps_others_back(lies: list[dict[Any, Any]]) -> None:
-    """Whatever workers say, if it has a row for each of their sub-environments, it is gathered."""
     for lie in lies:
         check_infos(lie, 1)
     gather_infos(lies, [1] * len(lies), _ROOM)

@@ -47,12 +47,10 @@ class BoxOfMine(spaces.Box):
 
 
 def through(space: Space) -> Space:
-    """Encodes a space down to bytes, and builds it again."""
     return decode_space(decode(encode(encode_space(space))), max_elements=MANY)
 
 
 def parts(space: Any) -> list[Space]:
-    """The spaces directly inside of a space."""
     if isinstance(space, spaces.Dict):
         return list(space.spaces.values())
     if isinstance(space, spaces.Sequence):
@@ -86,7 +84,6 @@ def assert_same_attributes(expected: Any, actual: Any) -> None:
 
 
 def samples(space: Space) -> object:
-    """Samples of a space, or how Gymnasium fails to take them (of the full range of float64)."""
     space.seed(123)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # numpy's, about casts that Box.sample makes
@@ -97,7 +94,6 @@ def samples(space: Space) -> object:
 
 
 def assert_crosses(space: Space) -> None:
-    """Asserts that a space arrives equal, with the same attributes, and samples alike."""
     arrived = through(space)
     assert arrived == space
     assert repr(arrived) == repr(space)
@@ -212,7 +208,6 @@ def test_uniform_bounds_are_compact() -> None:
 
 @st.composite
 def boxes(draw: st.DrawFn) -> Space:
-    """Boxes of any dtype and shape, with bounds that may be infinite, equal, or uniform."""
     dtype = np.dtype(draw(st.sampled_from(["i1", "i2", "i4", "i8", "u1", "u4", "f2", "f4", "f8"])))
     shape = tuple(draw(st.lists(st.integers(0, 3), max_size=3)))
     number = st.integers(0, 50)
@@ -256,7 +251,6 @@ leaves = (
 
 @given(st.recursive(leaves, collections_of, max_leaves=6))
 def test_nested_spaces_arrive(space: Space) -> None:
-    """Spaces nested in any way arrive with every attribute and the same samples."""
     assert_crosses(space)
 
 
@@ -270,7 +264,6 @@ def test_subclass_arrives_as_its_gymnasium_base() -> None:
 
 
 def test_custom_space_describes_itself() -> None:
-    """A custom space arrives with its type, its repr, its shape, and its dtype as text."""
     space = through(CustomSpace())
     assert isinstance(space, OpaqueSpace)
     assert space.type_name == f"{__name__}.CustomSpace"
@@ -304,7 +297,6 @@ def test_custom_spaces_compare_copy_and_batch() -> None:
     "space", [spaces.Box(0, 1, (1,), np.longdouble), spaces.Text(3, charset="a\udc80")]
 )
 def test_space_that_the_wire_cannot_carry_is_described(space: Space) -> None:
-    """Long doubles and lone surrogates make a space opaque, not an environment unusable."""
     assert isinstance(through(space), OpaqueSpace)
 
 
@@ -430,12 +422,10 @@ ONE = np.array(1, "f4")
 
 
 def without(value: dict[str, Any], name: str) -> dict[str, Any]:
-    """A description that lacks an attribute."""
     return {key: item for key, item in value.items() if key != name}
 
 
 def lies(honest: dict[str, Any], **fields: Iterable[object]) -> list[dict[str, Any]]:
-    """Descriptions of which one attribute is not as it should be."""
     return [honest | {name: lie} for name, values in fields.items() for lie in values]
 
 
@@ -471,13 +461,11 @@ def lies(honest: dict[str, Any], **fields: Iterable[object]) -> list[dict[str, A
     ids=lambda value: repr(value)[:60],
 )
 def test_malformed_description_is_refused(value: object) -> None:
-    """Wrong kinds, types, dtypes, shapes, ranges and contradictions build nothing."""
     with pytest.raises(RemoteProtocolError):
         decode_space(value, max_elements=MANY)
 
 
 def test_description_of_a_custom_space_is_cleaned() -> None:
-    """Text of an opaque space is bounded and printable, whatever the peer sends."""
     space = decode_space(
         OPAQUE | {"type": "\x1b[31m" * 100, "text": "\u202e" * 9999, "dtype": "\n"},
         max_elements=MANY,

@@ -22,7 +22,6 @@ def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
 
 
 def open_to_all(router: zmq.Socket[bytes]) -> CurvePort:
-    """A port without keys."""
     loop, log = Loop(lambda error: None), Log(lambda line: None)
     return CurvePort(router, loop, None, lambda key, address: True, log, 10)
 

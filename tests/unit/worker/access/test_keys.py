@@ -52,7 +52,6 @@ def test_the_list_of_clients_knows_names_and_comments(tmp_path: Path, encoding: 
 
 
 def test_a_broken_list_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is wrong with it is the same each time, those on the last one stay, and it heals."""
     path = tmp_path / "clients"
     write(path, [f"{key_text(ALICE)} alice"])
     found = AuthorizedClients(path, {})

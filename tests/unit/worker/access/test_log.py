@@ -34,7 +34,6 @@ def test_a_log_cannot_be_filled() -> None:
 
 
 def test_a_log_that_nobody_reads_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its stream is closed, or a pipe whose reader has gone."""
     read, write = os.pipe()
     os.close(read)
     broken = open(write, "w", buffering=1)  # noqa: SIM115
@@ -47,7 +46,6 @@ def test_a_log_that_nobody_reads_ends_nothing(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_line_is_short_plain_and_one(form: str) -> None:
-    """Whatever there is in a value."""
     evil = "a\n\r\x1b[2J\x85\u2028\u202e\ud800\"'\\ b=c" + "x" * 10_000
     line = FORMS[form](0.0, "info", "jail_opened", {"client": evil, "number": 7, "some": True})
     assert line.isprintable()

@@ -56,7 +56,6 @@ class _Jails:
 
 
 def places(idle_s: int, sessions: Sessions, jails: Any, uploads: Any, wires: Any) -> Places:
-    """Those of a server that knows of these connections."""
     return Places(Quotas(), idle_s, sessions, jails, uploads, MagicMock(), lambda: wires)
 
 
@@ -76,7 +75,6 @@ def test_a_client_that_is_not_heard_of_loses_its_jails(idle_s: int, ended: list[
 
 @pytest.mark.parametrize("idle_s", range(1, 9))
 def test_a_client_that_fell_silent_gave_nothing_up(idle_s: int) -> None:
-    """Also where time passes between two looks."""
     times: Iterator[int] = repeat(0)
     sessions, jails = Sessions(lambda: next(times)), _Jails(keya=7)
     session = sessions.connect(b"1", b"key", b"a")
@@ -101,7 +99,6 @@ def test_a_session_without_connections_and_jails_is_forgotten() -> None:
 
 
 def test_the_last_client_has_a_moment_to_hear_why() -> None:
-    """It is quiet once no jail has been open for a while, and a new one begins that again."""
     now = [0.0]
     drain = Drain(60.0, lambda: now[0])
     for busy, at, quiet in (

@@ -82,7 +82,6 @@ def test_a_state_folder_of_somebody_else_is_not_used(
 def test_keys_are_kept_where_others_can_change_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whether it was chosen, or is where a server's note is looked for."""
     chosen = tmp_path / "chosen"
     chosen.mkdir(mode=0o700)
     assert state_folder.state_dir(chosen, create=True) == chosen

@@ -86,7 +86,6 @@ def test_without_addresses_gpus_are_counted_by_their_nodes() -> None:
 
 
 def test_all_is_what_computes_and_renders() -> None:
-    """No display, no modes, no profiler, no switch, no disk, and no zeros to map."""
     assert (
         gpu_devices(SERVER)
         == granted(True, SERVER).devices

@@ -18,7 +18,6 @@ UNCONFINED: tuple[dict[str, str], ...] = (
 
 
 def wire(**changes: Any) -> dict[str, Any]:
-    """An ordinary confinement as it travels, but for this."""
     return {**asdict(Confinement()), **changes}
 
 

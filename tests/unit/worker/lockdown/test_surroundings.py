@@ -14,7 +14,6 @@ from envhub_worker.protocol.runtime import OWN, Runtime
 
 
 def layers(*names: str) -> list[dict[str, object]]:
-    """What the probe finds where only these layers can be had."""
     every = ["user-namespace", "namespaces", "mount-namespace", "landlock", "seccomp"]
     return [{"layer": name, "available": name in names} for name in every]
 

@@ -50,7 +50,6 @@ class Oracle(VectorEnv[Any, Any, Any]):
 
 @given(st.lists(INFOS, min_size=1, max_size=4))
 def test_infos_are_joined_as_gymnasium_joins_them(infos: list[dict[str, Any]]) -> None:
-    """The same values, dtypes, masks and order of keys, or an exception of the same class."""
     pairs = [(index, info) for index, info in enumerate(infos) if info]
     try:
         expected = Oracle().join(infos)
@@ -73,7 +72,6 @@ class Slab:
         self.outcomes: list[int] = []
 
     def cross(self, infos: list[dict[str, Any]]) -> dict[str, Any]:
-        """Write a step's infos, and read them as the client does."""
         pairs = [(index, info) for index, info in enumerate(infos) if info]
         outcome, length = self.writer.write(pairs)
         self.outcomes.append(outcome)

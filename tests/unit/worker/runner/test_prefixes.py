@@ -136,7 +136,6 @@ def begun(envs: SubEnvs, name: str, watches: Watches | None = None) -> bool:
 
 
 def noticed(watches: Watches) -> list[str]:
-    """What is told in front of the next reply."""
     watches.look()
     frames = watches.in_front(REPLY)
     if frames == REPLY:

@@ -17,12 +17,10 @@ SEEN = np.zeros((3, 2), np.float32)
 
 
 def vector(observation: Any, **attributes: Any) -> Any:
-    """Three sub-environments whose resets observe this."""
     return SimpleNamespace(num_envs=3, reset=lambda: (observation, {}), **attributes)
 
 
 def one_space(space: Space, action: Space) -> dict[str, Space]:
-    """The same space under both names."""
     return {
         "single_observation_space": space,
         "observation_space": space,
@@ -110,8 +108,6 @@ def test_a_shape_that_is_not_the_spaces_tells_by_its_dimensions() -> None:
 
 
 def test_a_reset_that_fails_is_the_callers() -> None:
-    """What tells nothing is taken as it is declared."""
-
     def reset() -> Any:
         raise KeyError("options")
 

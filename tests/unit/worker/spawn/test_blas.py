@@ -9,7 +9,6 @@ from envhub_worker.spawn import blas
 
 
 def unreadable(path: str) -> None:
-    """What loading a library raises that this user may not read."""
     raise OSError(f"{path}: cannot open shared object file: Permission denied")
 
 

@@ -59,7 +59,6 @@ def test_a_cache_that_the_caller_gives_stays_as_it_is(
 
 @pytest.fixture(autouse=True)
 def stub(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The stub, and no module of it afterwards."""
     before = list(sys.meta_path)
     for name in [one for one in sys.modules if one.partition(".")[0] == "lerobot"]:
         monkeypatch.delitem(sys.modules, name)
@@ -71,7 +70,6 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def test_the_contract_is_there_and_it_warns_once() -> None:
-    """Configurations to annotate with and to inherit from, types of features, and constants."""
     with pytest.warns(UserWarning, match="lerobot is not installed in the jail"):
         importlib.import_module("lerobot")
     with warnings.catch_warnings():

@@ -48,7 +48,6 @@ def confinement(request: pytest.FixtureRequest) -> Confinement:
 
 @pytest.fixture(scope="module")
 def zygote(confinement: Confinement) -> Iterator[tuple[Spawner, str]]:
-    """One for all jails, and their snapshot."""
     with open_folder() as folder, spawner_in(folder, confinement) as spawner:
         yield spawner, make_snapshot(folder)
 
@@ -64,7 +63,6 @@ def cell(zygote: tuple[Spawner, str], confinement: Confinement) -> Iterator[Cell
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    """A folder that a jail's user may cross."""
     with open_folder() as folder:
         yield folder
 
@@ -150,7 +148,6 @@ def test_no_daemon_outlives_its_jail(cell: Cell, folder: Path, end: str) -> None
 
 
 def test_a_process_that_started_ahead_is_used(folder: Path) -> None:
-    """It becomes the zygote, and what it has imported serves a jail that is as confined."""
     ahead = ZygoteProcess(OWN, folder, {}, ahead=True)
     with spawner_in(folder, STRICT, ahead=ahead) as spawner:
         cell = new_cell(spawner, make_snapshot(folder), STRICT)

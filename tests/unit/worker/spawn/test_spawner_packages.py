@@ -33,7 +33,6 @@ STRICT = Confinement(profile="strict")
 
 
 def with_packages(folder: Path) -> Runtime:
-    """One module, and one that has the name of a module of the standard library."""
     packages = folder / "packages"
     packages.mkdir()
     (packages / "mine.py").write_text(MODULE)
@@ -44,7 +43,6 @@ def with_packages(folder: Path) -> Runtime:
 
 @pytest.fixture
 def folder() -> Iterator[Path]:
-    """A folder that a jail's user may cross."""
     with open_folder() as folder:
         yield folder
 
@@ -90,7 +88,6 @@ def test_packages_are_as_deep_as_paths_go(folder: Path, runtime: Runtime) -> Non
 
 
 def test_packages_of_the_interpreter_are_not_there(cell: Cell) -> None:
-    """Neither those of the tests' interpreter, nor what a distribution added to its base."""
     paths = cell.run("import sys; result = sys.path")["result"]
     assert not [path for path in paths if "site-packages" in path or "dist-packages" in path]
     assert cell.run("import gymnasium")["error"] == "ModuleNotFoundError"
@@ -105,7 +102,6 @@ def test_programs_that_are_started_have_the_packages_too(cell: Cell) -> None:
 
 
 def packages_of(cell: Cell) -> str:
-    """Their folder, which lies beside its snapshot."""
     return str(Path(cell.jail.spec.snapshot).with_name("packages"))
 
 
@@ -121,7 +117,6 @@ def test_shared_packages_cannot_be_written(cell: Cell) -> None:
 
 
 def test_the_zygote_imports_no_package(folder: Path, runtime: Runtime) -> None:
-    """What was started ahead for these packages is used, and has none of the server's either."""
     ahead = ZygoteProcess(runtime, folder, {}, ahead=True)
     with spawner_in(folder, STRICT, runtime=runtime, ahead=ahead) as spawner:
         cell = new_cell(spawner, make_snapshot(folder), STRICT)

@@ -94,7 +94,6 @@ def ours() -> Iterator[Jails]:
 
 
 def opened(of: Jails, runners: int = 1, **policy: Any) -> Any:
-    """The record of a new jail."""
     confinement = asdict(Confinement(**policy))
     of.open(MINE, m.OpenJail("x", "", "", "/snapshot", "env.py", confinement, runners))
     return of.open_ones()[-1]
@@ -203,7 +202,6 @@ def test_another_hosts_client_chooses_no_larger_messages(ours: Jails) -> None:
 
 
 def test_a_kept_jail_loses_so_many_runners(ours: Jails, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The death of each is remembered."""
     monkeypatch.setattr(jails, "MAX_LOST", 0)
     entry = opened(ours)
     entry.lost[7] = whole_jail("exit")

@@ -11,7 +11,6 @@ from envhub_worker.supervisor.records import IdleTimer
 
 
 def test_steps_past_the_server_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step that was asked for and not answered, one that was, and a message that is owed."""
     now = [0.0]
     monkeypatch.setattr(records, "monotonic", lambda: now[0])
     slabs = [os.memfd_create(name) for name in ("request", "reply")]

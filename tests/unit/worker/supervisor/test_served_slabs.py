@@ -34,7 +34,6 @@ class Runner:
         self.asked, self.tells = words.words(self.request), words.words(self.reply)
 
     def answer(self, outcome: int = words.DONE, length: int = 0, infos: bytes = b"") -> None:
-        """Write an answer, and ring if the server sleeps."""
         self.reply[words.HEADER_BYTES : words.HEADER_BYTES + len(infos)] = infos
         self.tells[words.OUTCOME], self.tells[words.LENGTH] = outcome, length
         self.tells[words.SEQUENCE] = self.asked[words.SEQUENCE]
@@ -42,13 +41,11 @@ class Runner:
             self.ring()
 
     def ring(self) -> None:
-        """Whether there is something to hear or not."""
         os.eventfd_write(self.servers_bell, 1)
 
 
 @pytest.fixture
 def steps(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServedSteps]:
-    """Of no runner yet, on a machine of several cores."""
     monkeypatch.setattr(*inside.MAY_SPIN, True)
     made = ServedSteps()
     yield made

@@ -52,7 +52,6 @@ def test_one_look_does_for_all() -> None:
 
 
 def come_to(limits: Limits, usage: dict[str, int] = _NONE, *, own_root: bool = False) -> list[str]:
-    """Of a jail whose one runner is this process."""
     return list(reached(limits, usage, [os.getpid()], own_root=own_root))
 
 

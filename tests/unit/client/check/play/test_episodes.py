@@ -74,7 +74,6 @@ def played_alone(index: int, episodes: int, seed: int) -> list[tuple[int, float,
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("episodes", [1, 3, 10])
 def test_episodes_are_those_of_each_environment_alone(mode: str, episodes: int) -> None:
-    """Returns, lengths and successes are the same as without any vector, in every mode."""
     result = rollout(scripted(mode), episodes=episodes, seed=5)
     found = [(e.sub_env, *e.returns, e.length, e.success) for e in result.episodes]
     expected = [
@@ -165,7 +164,6 @@ def test_only_ended_environments_are_reset_by_hand() -> None:
     ],
 )
 def test_rewards_that_cannot_be_counted_are_refused(rewards: Any) -> None:
-    """Wrong shapes, too many components and things that are no numbers."""
     no = [False, False]
     with pytest.raises(RolloutError, match="rewards"):
         EpisodeCounter(2, 2, None).step(rewards, no, no, {})

@@ -32,7 +32,6 @@ def frame(height: int = 4, width: int = 6, value: int = 7) -> Any:
     "rendered", [(frame(), frame(2, 2)), [frame()], np.stack([frame(), frame(value=9)]), frame()]
 )
 def test_the_first_sub_environment_is_taken(rendered: Any) -> None:
-    """From tuples, lists, stacked arrays, or an environment that draws all of them at once."""
     assert np.array_equal(first_frame(rendered, "rgb_array"), frame())
 
 
@@ -87,7 +86,6 @@ def test_an_environment_that_draws_nothing_is_told_how(rendered: Any) -> None:
     ids=range(13),
 )
 def test_fps_is_sensible_whatever_the_metadata_says(metadata: Any, fps: float) -> None:
-    """The environment's own where it can be one."""
     assert fps_of(metadata) == fps
 
 

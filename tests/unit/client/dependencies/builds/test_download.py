@@ -22,7 +22,6 @@ from tests.support.ports import QuietHandler, serving
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
-    """One with two commits, of which the first is tagged."""
     folder = tmp_path / "served" / "org" / "repo"
     folder.mkdir(parents=True)
     make_repository(folder, {"setup.py": "1", "a/b.py": "2"})
@@ -95,7 +94,6 @@ def test_links_and_submodules_are_left_out(url: str, repository: Path, target: P
 
 
 def test_attributes_do_nothing(url: str, repository: Path, target: Path) -> None:
-    """The bytes are those of the commit, whatever its attributes ask for."""
     (repository / ".gitattributes").write_text("* export-ignore\n*.py filter=x text eol=crlf\n")
     (repository / "setup.py").write_bytes(b"$Format:%H$\n")
     download.check_out(url, commit(repository), target, print)
@@ -216,7 +214,6 @@ def test_what_was_missing_is_named(log: str, said: str) -> None:
 
 
 def test_nothing_is_guessed() -> None:
-    """A file of its own that is missing is no program, and few programs come as wheels."""
     assert project.wheel_for("error: command 'swig' failed: No such file or directory") == "swig<5"
     assert project.wheel_for("error: command 'gcc' failed: No such file or directory") == ""
     assert project.advice("No such file or directory: 'README.md'\nSyntaxError") == ""
@@ -225,7 +222,6 @@ def test_nothing_is_guessed() -> None:
 def test_downloads_are_bounded_and_verified(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another file than the one that is known is refused, and so is one that is too large."""
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     shelf, target = tmp_path / "shelf", tmp_path / "target"
     shelf.mkdir()

@@ -31,7 +31,6 @@ def packed(
 
 
 def unpacked(archive: Path) -> Path:
-    """Its one folder, in a folder beside it."""
     folder = archive.parent / "tree"
     folder.mkdir()
     return trees.unpack_tree(archive, folder, "x 1.0")
@@ -98,7 +97,6 @@ def test_more_than_one_of_its_kind(tmp_path: Path, names: tuple[str, ...]) -> No
 
 
 def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of all files together, and of their number."""
     archive = packed(tmp_path, ("x/a", b"1" * 100, b"0"), ("x/b", b"1" * 100, b"0"))
     folders = packed(tmp_path, *((f"x/{n}", b"", b"5") for n in range(8)), name="folders.tar.gz")
     for bound, value, one in (

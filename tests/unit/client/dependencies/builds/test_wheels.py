@@ -77,7 +77,6 @@ def add(name: str, mode: int = 0o100644) -> Callable[[zipfile.ZipFile], None]:
 def test_what_no_wheel_has_is_refused(
     tmp_path: Path, change: Callable[[zipfile.ZipFile], None], said: str
 ) -> None:
-    """Links, ways out of the folder, files that RECORD does not know."""
     wheel = make_wheel(tmp_path, "some-name")
     with zipfile.ZipFile(wheel, "a") as archive:
         change(archive)
@@ -86,7 +85,6 @@ def test_what_no_wheel_has_is_refused(
 
 
 def test_what_its_files_say_is_held_against_them(tmp_path: Path) -> None:
-    """The hashes of RECORD, the packing, which has bounds, the metadata, and that it is a zip."""
     wheel = make_wheel(tmp_path, "some-name")
     check(wheel)
     with refused_dependency("integrity", match="not the file that its RECORD says"):
@@ -119,7 +117,6 @@ def rewritten(
     packing: int = zipfile.ZIP_STORED,
     edit: tuple[str, bytes, bytes] = ("", b"", b""),
 ) -> Path:
-    """The same in another packing, with other code, or with a text replaced in one of its files."""
     other = wheel.parent / "other" / wheel.name
     other.parent.mkdir(exist_ok=True)
     with zipfile.ZipFile(wheel) as old, zipfile.ZipFile(other, "w", packing) as new:

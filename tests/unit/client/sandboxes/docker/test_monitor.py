@@ -103,7 +103,6 @@ def test_the_lifeline_is_cut_when_the_monitor_is_killed(tmp_path: Path) -> None:
 
 
 def test_an_engine_that_fails_is_quoted(tmp_path: Path) -> None:
-    """With its exit code, and the end of what it said."""
     with kept(tmp_path, "seq 5000; echo 'no such runtime' >&2; exit 125") as made:
         assert made.said["ended"] == 125
         assert str(made.said["tail"]).endswith("4999\n5000\nno such runtime\n")

@@ -26,7 +26,6 @@ THERE = {
 
 
 def declares(*lines: str, supports: str = "", python: str = "") -> PackageRequest:
-    """What a repository may declare, and the Python that the caller asks for."""
     wanted = tuple(parse_requirement(line, "a line") for line in lines)
     return PackageRequest("requirements.txt", wanted, supports, python)
 
@@ -101,7 +100,6 @@ LOCK = Lock(
 
 
 def test_the_tag_is_the_hash_of_all_that_an_image_is_made_of() -> None:
-    """Another base, another package or another library is another image."""
     tags = {
         packages.tag_for("org/repo", base, lock, system)
         for base in ("sha256:1", "sha256:2")

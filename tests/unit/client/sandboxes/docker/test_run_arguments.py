@@ -60,7 +60,6 @@ SAID: dict[str, Any] = {
 
 
 def found(**changes: Any) -> Surroundings:
-    """What a container's server said, with changes."""
     return attestation.parse(json.dumps({**SAID, **changes}).encode())
 
 
@@ -231,7 +230,6 @@ def test_the_profile_permits_what_jails_may_call() -> None:
 
 
 def test_the_profile_permits_what_lockdown_calls() -> None:
-    """Every system call that the worker makes by its number, but for what it tries in vain."""
     tried = {"ptrace"}
     called = set()
     for name in modules():
@@ -327,7 +325,6 @@ def test_an_engine_on_another_machine_is_refused(
 def engine_that_says(
     folder: Path, monkeypatch: pytest.MonkeyPatch, version: str, facts: dict[str, Any]
 ) -> Engine:
-    """What is made of a program called docker."""
     program = folder / "docker"
     program.write_text(
         f"#!/bin/sh\n[ $1 = --version ] && echo '{version}' || echo '{json.dumps(facts)}'\n"
@@ -372,14 +369,12 @@ def test_an_engine_says_what_it_is(
 def test_an_engine_without_a_server_is_not_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Docker's program answers without one too, and says what is wrong."""
     facts = {"ServerErrors": ["Cannot connect to the Docker daemon at unix:///x"]}
     with pytest.raises(SandboxUnavailableError, match="systemctl start docker"):
         engine_that_says(tmp_path, monkeypatch, "Docker version 28", facts)
 
 
 def test_secrets_do_not_go_to_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its program gets what it needs of our environment, and no more."""
     monkeypatch.setenv("HF_TOKEN", "secret")
     monkeypatch.setenv("DOCKER_CONFIG", "/somewhere")
     assert "HF_TOKEN" not in engines.environment()

@@ -78,8 +78,6 @@ def temporary(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.fixture
 def sandbox(tmp_path: Path) -> Callable[..., Any]:
-    """That of a repository whose engine does this."""
-
     def made(what: str, *, mounts: bool = False) -> PublishedContainer | RepositoryContainer:
         program = tmp_path / "docker"
         program.write_text(_ENGINE.format(python=sys.executable, what=what, key=_KEY))
@@ -109,7 +107,6 @@ def test_the_command_line_is_that_of_one_that_is_mounted_but_for_its_network() -
 
 
 def test_a_policy_is_permitted_there() -> None:
-    """A weaker profile, the container's network and a GPU, where the policy says so."""
     words = run_arguments.run_arguments(
         PODMAN, replace(PUBLISHED, network="host", gpus="all", profile="container")
     )
@@ -183,7 +180,6 @@ def test_what_does_not_start_leaves_nothing(
 
 
 def test_a_fork_does_not_keep_a_container(sandbox: Callable[..., Any], tmp_path: Path) -> None:
-    """It has no copy of the other end of its stdin, and does not end it either."""
     use = sandbox("serves").acquire(tmp_path)
     fork = os.fork()
     if fork == 0:

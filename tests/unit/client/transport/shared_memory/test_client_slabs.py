@@ -34,7 +34,6 @@ MASK = spaces.Dict({"mask": spaces.Box(0, 1, (4,), np.bool_)})
 
 @pytest.fixture
 def slab_of() -> Iterator[Callable[..., ObservationSlab]]:
-    """Makes one, which is closed afterwards."""
     made: list[ObservationSlab] = []
 
     def make(space: Any, slots: int = 1) -> ObservationSlab:
@@ -149,7 +148,6 @@ def serving(path: Path, losses: int) -> threading.Thread:
 def test_a_lost_connection_is_made_again(
     tmp_path: Path, losses: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a server that waited in vain has given up is brought once more."""
     monkeypatch.chdir(tmp_path)  # a socket's path has 108 bytes
     server = serving(Path("fds"), losses)
     ours, theirs = os.pipe()
@@ -229,7 +227,6 @@ def schema(part: dict[str, Any]) -> Schema:
 
 
 def test_they_are_joined_as_parts_are() -> None:
-    """The same arrays in the same order, and fresh ones each time."""
     parts = [infos(3, 0.5), infos(2, 7.5)]
     joined = JoinedColumns([schema(part) for part in parts], BOUNDS)
     expected, found = batches.join_infos(parts, [3, 2]), joined.infos()

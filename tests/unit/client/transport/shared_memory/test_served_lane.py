@@ -70,7 +70,6 @@ class Both:
         self.server.ask(frame, "owner")
 
     def answer(self, outcome: int = slabs.DONE, infos: bytes = b"", length: int = -1) -> Any:
-        """How the client reads what a runner has written."""
         reply = self.memory[1]
         start = slabs.HEADER_BYTES
         reply[start : start + len(infos)] = infos
@@ -174,7 +173,6 @@ class Served:
         return self.server.sent[-1][0].stepped
 
     def reward(self) -> float:
-        """That of the next result, all of which is what one runner wrote."""
         self.lane.wait(Deadline(0))
         observation, rewards, *_ = self.lane.result()
         assert observation.shape == (self._shards, *SMALL.shape)
@@ -191,7 +189,6 @@ class Served:
 
 
 def slab(outcome: int = slabs.DONE, reward: float = 0, said: m.Message | None = None) -> Frames:
-    """What the server sends of one runner's slabs."""
     infos = b"" if said is None else bytes(m.pack(said)[0])
     layout = slabs.observation_layout(SMALL, 1, 1)
     batch = bytearray(layout.total_bytes)
@@ -200,7 +197,6 @@ def slab(outcome: int = slabs.DONE, reward: float = 0, said: m.Message | None = 
 
 
 def told(**changes: Any) -> Frames:
-    """A runner's own message for a step of one sub-environment."""
     no = np.zeros(1, np.bool_)
     fields = {"observation": np.zeros((1, 4)), "rewards": np.zeros(1), "info": {}}
     return m.pack(m.StepDone(**{**fields, "terminations": no, "truncations": no, **changes}))
@@ -211,7 +207,6 @@ RAISED = m.RaisedException("ValueError", "ValueError", "no", "", "step")
 
 
 def test_several_steps_go_as_messages_and_one_through_slabs() -> None:
-    """The lane changes over where no answer is owed, and back after two steps one by one."""
     served = Served()
     assert not served.lane.takes_more
     served.by_message()

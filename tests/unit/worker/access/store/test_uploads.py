@@ -33,7 +33,6 @@ def brought(uploads: Uploads, key: bytes, data: bytes, *, whole: bool = True) ->
 
 
 def shared(folder: Path, quotas: Quotas | None = None) -> Uploads:
-    """One server's part of a shared store."""
     return Uploads(folder, quotas or Quotas(), shared=True)
 
 

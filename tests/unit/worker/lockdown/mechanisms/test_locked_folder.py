@@ -7,7 +7,6 @@ from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder, remove
 
 
 def test_only_folders_of_ours_that_nobody_holds_are_removed(tmp_path: Path) -> None:
-    """None of another name or another user, none without a lock, and nothing that a link names."""
     held = LockedFolder("envhub-", tmp_path)
     for name in ("envhub-deserted", "envhub-noguards", "another", "envhub-foreign1"):
         (tmp_path / name).mkdir()

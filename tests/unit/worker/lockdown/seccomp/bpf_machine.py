@@ -34,7 +34,6 @@ def _holds(one: BpfInstruction, accumulator: int) -> bool:
 
 
 def listing(program: Sequence[BpfInstruction]) -> str:
-    """One line per instruction, for people and golden files."""
     names = {
         0x20: "load",
         0x54: "and",

@@ -170,7 +170,6 @@ _NOBODY = 1 << 30
 
 @pytest.fixture(scope="module")
 def children() -> Iterator[tuple[int, int]]:
-    """Two processes, of which neither is below the other."""
     both = [subprocess.Popen(["sleep", "600"]) for _ in range(2)]
     yield both[0].pid, both[1].pid
     for one in both:

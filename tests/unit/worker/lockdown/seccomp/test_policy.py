@@ -58,7 +58,6 @@ class Filter:
 @machines
 @pytest.mark.parametrize(("namespaced", "network"), VARIANTS)
 def test_program_is_the_golden_one(machine: str, namespaced: bool, network: str) -> None:
-    """Its search tree agrees with the table for every number to well above the highest."""
     name = f"seccomp-{machine}-{'namespaced' if namespaced else 'bare'}-{network}.txt"
     verdicts = policy_table(namespaced=namespaced, network=network)
     program = filter.program(machine, verdicts)
@@ -117,7 +116,6 @@ WITHOUT_EFFECT = """
 def test_what_no_library_needs_never_reaches_the_kernel(
     machine: str, namespaced: bool, names: str, verdict: int
 ) -> None:
-    """Under every profile and network, whatever the arguments."""
     check = Filter(machine, namespaced, "host")
     for name in names.split():
         for arguments in ((), (0,), (1, 2, 3, 4, 5, 6)):
