@@ -38,10 +38,8 @@ CODES = {
 
 
 def test_every_error_has_its_code(checkout: Path) -> None:
-    """As the table of ``docs/cli.md`` says.
-
-    A remote ValueError is the environment's; one of this process is ours.
-    """
+    """As the table of ``docs/cli.md`` says. A remote ValueError is the environment's; one of this
+    process is ours."""
     for code, kinds in CODES.items():
         assert [code_for(kind("text")) for kind in kinds] == [code] * len(kinds)
     assert code_for(errors.remote_error("ValueError", "ValueError", "x")) == Exit.ENVIRONMENT
@@ -71,9 +69,7 @@ def fail(error: BaseException, *, debug: bool) -> int:
 
 def test_a_failure_is_one_message(capsys: pytest.CaptureFixture[str]) -> None:
     """On stderr, with a hint at --debug, which shows both tracebacks, where there is more to see.
-
-    Nothing of a bug of ours is blamed on the environment.
-    """
+    Nothing of a bug of ours is blamed on the environment."""
     assert fail(UsageError("say [red]this[/red]"), debug=False) == 2
     assert capsys.readouterr() == ("", "Error: say [red]this[/red]\n")
     theirs = errors.remote_error("BrokenPipeError", "BrokenPipeError", "x", "far \x1b away")

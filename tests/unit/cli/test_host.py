@@ -11,14 +11,9 @@ _NO_LIMIT = str((1 << 63) - 4096)
 
 
 def host(folder: Path, own: str, mounts: dict[str, str], **groups: dict[str, int | str]) -> Path:
-    """A ``/proc`` of 1000 MiB, and the control groups that it tells of.
-
-    Args:
-        folder: Where it is made.
-        own: What ``/proc/self/cgroup`` says.
-        mounts: For each folder, the group that is mounted there, with the kind and its options.
-        **groups: The files of each group, below ``folder``; ``__`` for a slash.
-    """
+    """A ``/proc`` of 1000 MiB, and the control groups that it tells of. For each folder, ``mounts``
+    has the group that is mounted there, with the kind and its options; ``groups`` the files of each
+    group, below ``folder``, with ``__`` for a slash."""
     proc = folder / "proc"
     (proc / "self").mkdir(parents=True)
     (proc / "meminfo").write_text("MemTotal: 2048000 kB\nMemAvailable: 1024000 kB\n")

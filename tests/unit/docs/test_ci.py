@@ -214,8 +214,7 @@ _PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 
 def installs(text: str) -> list[str]:
     """Each command that installs packages, but those of a lock or of no further ones; and images
-    that are named by a tag alone.
-    """
+    that are named by a tag alone."""
     lines = text.replace("\\\n", " ").splitlines()
     found = [line for line in lines if re.search(r"\bpip\W+(install|download|wheel)\b", line)]
     alone = ("--require-hashes", "--no-deps --no-build-isolation")

@@ -1,7 +1,5 @@
-"""Both distributions and the image hold what they should, and what an index looks at.
-
-``python -m tests.distributions`` builds, checks and installs both; this is what needs no network.
-"""
+"""Both distributions and the image hold what they should, and what an index looks at. ``python -m
+tests.distributions`` builds, checks and installs both; this is what needs no network."""
 
 import re
 import subprocess

@@ -158,10 +158,8 @@ def anchors(text: str) -> set[str]:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=named)
 def test_a_document_names_what_there_is(document: Path) -> None:
-    """Files are there, and so are the titles that an anchor means, and paths in backquotes.
-
-    Nothing names a person's machine or tools, and nothing is a note to oneself.
-    """
+    """Files are there, and so are the titles that an anchor means, and paths in backquotes. Nothing
+    names a person's machine or tools, and nothing is a note to oneself."""
     text = document.read_text()
     for target in links(text):
         path, _, anchor = target.partition("#")
@@ -179,10 +177,8 @@ def test_a_document_names_what_there_is(document: Path) -> None:
 
 
 def test_the_map_has_every_package() -> None:
-    """Every folder of the two packages, and every module that stands beside them.
-
-    The source is as finished as the documents are.
-    """
+    """Every folder of the two packages, and every module that stands beside them. The source is as
+    finished as the documents are."""
     words = set(code_words((CHECKOUT / "docs" / "architecture.md").read_text()))
     missing = set()
     for package, place in (("envhub_sandbox", ""), ("envhub_worker", "worker/")):

@@ -280,9 +280,8 @@ def test_zeromq_is_spoken_in_a_few_packages() -> None:
 
 def test_nothing_unpickles_but_the_jail() -> None:
     """There is one ``loads`` of anything but JSON and TOML in the tree, and it is in the jail.
-
-    Neither package has a deserialiser at hand; cloudpickle is the client's way out, the jail's in.
-    """
+    Neither package has a deserialiser at hand; cloudpickle is the client's way out, the jail's
+    in."""
     assert list(loaders()) == [("envhub_worker.runner.runner", "cloudpickle.loads")]
     every = [*arrows("envhub_sandbox"), *arrows("envhub_worker")]
     assert [one for one in every if one[1].split(".")[0] in DESERIALISERS] == []

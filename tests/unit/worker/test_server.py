@@ -64,11 +64,9 @@ def refused(endpoint: str) -> m.Refusal:
 
 
 def test_what_a_request_meets_is_in_the_log() -> None:
-    """With the way to it, where it is nothing that a client did; the client is answered.
-
-    What the machine lacks is no mistake: the client reads that it is the server that lacks it, and
-    the operator what to do.
-    """
+    """With the way to it, where it is nothing that a client did; the client is answered. What the
+    machine lacks is no mistake: the client reads that it is the server that lacks it, and the
+    operator what to do."""
     said = list[str]()
     gate = Failing(RuntimeError("our mistake"), Log(said.append, form=json_line))
     with serving(gate) as endpoint:

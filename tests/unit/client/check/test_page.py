@@ -25,9 +25,7 @@ _OURS = _DRAWN | {
 @pytest.mark.parametrize("text", HOSTILE)
 def test_a_page_has_the_tags_of_ours_alone(text: str) -> None:
     """The very same as with a harmless text, attributes included; and the text is there to read.
-
-    The control is a page that did not escape: it has other tags.
-    """
+    The control is a page that did not escape: it has other tags."""
     made, quiet = report_of(text), report_of(_QUIET)
     found, harmless = Page(page(made, made.findings)), page(quiet, quiet.findings)
     assert found.tags == Page(harmless).tags

@@ -97,9 +97,8 @@ def test_what_confined_it_is_text(text: str) -> None:
 
 
 def test_all_that_there_can_be_is_a_line_and_no_notice() -> None:
-    """As where it did not load, so that nobody knows which layers held. What no plain user can
-    have is no news of each run.
-    """
+    """As where it did not load, so that nobody knows which layers held. What no plain user can have
+    is no news of each run."""
     made = Report("./walk:env.py")
     quotas = {"layer": "user-quotas", "enforced": False, "detail": "shared"}
     for profile in ("strict", ""):

@@ -198,10 +198,8 @@ def test_the_most_particular_file_counts(tmp_path: Path) -> None:
     ],
 )
 def test_what_declares_nothing(tmp_path: Path, name: str, text: str) -> None:
-    """As PEP 723 says: a block that is not closed, of another kind, interrupted or indented.
-
-    Nor a project that only configures tools, or says what it needs once it is built.
-    """
+    """As PEP 723 says: a block that is not closed, of another kind, interrupted or indented. Nor a
+    project that only configures tools, or says what it needs once it is built."""
     assert repository(tmp_path, **{name: text}) is None
 
 

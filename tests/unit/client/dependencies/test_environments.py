@@ -62,10 +62,8 @@ def known(folder: Path) -> Environment:
 
 
 def test_packages_lie_in_a_folder_that_nobody_can_write(index: Index, tmp_path: Path) -> None:
-    """With what they need, what the worker imports, and bytecode; the pins are told.
-
-    Jails of root are another user: all can read it, whatever the umask was.
-    """
+    """With what they need, what the worker imports, and bytecode; the pins are told. Jails of root
+    are another user: all can read it, whatever the umask was."""
     make_wheel(index.folder, "wanted")
     before = os.umask(0o077)
     try:
@@ -231,11 +229,9 @@ def test_what_a_killed_maker_started_is_waited_for(index: Index, tmp_path: Path)
 
 
 def test_one_that_is_used_stays_and_the_answer_names_its_user(index: Index, tmp_path: Path) -> None:
-    """By a server that could start a jail, or a client whose environment could.
-
-    What is half made is collected, but not what somebody is making. Where others can write nothing
-    is used: somebody could have put another package in its place.
-    """
+    """By a server that could start a jail, or a client whose environment could. What is half made
+    is collected, but not what somebody is making. Where others can write nothing is used: somebody
+    could have put another package in its place."""
     env = made(repository(tmp_path / "repo"))
     half = environments.root() / ".building-0123-x"
     (half / "packages").mkdir(parents=True)

@@ -142,8 +142,7 @@ def test_no_index_is_asked_for_the_name_of_a_module(index: Index, tmp_path: Path
 
 def test_a_jail_names_few_modules(tmp_path: Path) -> None:
     """Of those of the table alone, each once, and none that every jail has: every one costs another
-    environment.
-    """
+    environment."""
     found = snapshot(tmp_path / "r", "import chess" + MAKE)
     names = ("made_up", "chess", "numpy.core.x", "six", "six", "cv2", "h5py", "scipy", "torch")
     taken = [note_missing(found, f"No module named '{name}'") for name in names]
@@ -155,8 +154,7 @@ def test_a_release_that_took_names_away_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As it is loaded, and not in a later step; a repository of today, or of no day, gets no date,
-    unlike one of years ago: there a package that raises for no reason may be too new.
-    """
+    unlike one of years ago: there a package that raises for no reason may be too new."""
     found = snapshot(tmp_path / "r", MAKE)
     for text, said in (
         ("`np.float_` was removed in the NumPy 2.0 release.", "{'extra': ['numpy<2']}"),

@@ -101,8 +101,7 @@ def test_two_packages_without_wheels_in_one_file(
     index: Index, tmp_path: Path, built: list[Source], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """uv names one at a time, and chooses no versions as long as another has none. Each costs a
-    resolution, so there is an end to it, before anything is built.
-    """
+    resolution, so there is an end to it, before anything is built."""
     for name in ("only-source", "deeper-source", "third-source"):
         source_distribution(index.folder, name, "1.5", tmp_path / "ran")
     with monkeypatch.context() as patch, refused_dependency("resolution", match="wheels"):

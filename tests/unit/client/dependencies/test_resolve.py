@@ -226,8 +226,7 @@ def test_only_what_was_uploaded_before_a_date(
     index: Index, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of the repository's packages; the worker's may be as new as it needs them, and no newer. A
-    source has a day as a wheel has.
-    """
+    source has a day as a wheel has."""
     make_sdist(index.folder, "unbuilt")
     wheels = [make_wheel(index.folder, "ages", version) for version in ("1.0", "2.0")]
     make_wheel(index.folder, "cloudpickle", "99.0")

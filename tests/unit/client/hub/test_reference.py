@@ -166,10 +166,8 @@ def test_form_is_read(text: str) -> None:
 
 @pytest.mark.parametrize(("text", "what", "write"), REFUSED)
 def test_refusal_names_the_reference_and_a_fix(text: str, what: str, write: str) -> None:
-    """A refused text comes back in the error, with what is wrong and what to write.
-
-    What stands between quotes is itself readable.
-    """
+    """A refused text comes back in the error, with what is wrong and what to write. What stands
+    between quotes is itself readable."""
     with pytest.raises(HubReferenceError) as caught:
         HubRef.parse(text)
     message = str(caught.value)

@@ -63,10 +63,8 @@ def test_what_another_puts_there_meanwhile_is_not_damaged(
 
 
 def test_published_files_load(slot: store.Slot) -> None:
-    """What was never stored is absent, not damaged. What went in comes out.
-
-    The tree holds nothing else: the jail is given it, and the hashes that vouch for it are outside.
-    """
+    """What was never stored is absent, not damaged. What went in comes out. The tree holds nothing
+    else: the jail is given it, and the hashes that vouch for it are outside."""
     assert store.load(slot) is None
     assert store.commits(slot.folder) == []
     store.publish(slot, records(), write, {"revision": "main"})
@@ -149,10 +147,8 @@ DAMAGE: dict[str, Damage] = {
 def test_damage_is_refused_with_the_command_that_repairs(
     published: store.Slot, damage: Damage, said: str
 ) -> None:
-    """Whatever was changed, nothing is returned, and the error's command makes room again.
-
-    What was changed is not taken for half deleted, either: somebody shall look at it.
-    """
+    """Whatever was changed, nothing is returned, and the error's command makes room again. What was
+    changed is not taken for half deleted, either: somebody shall look at it."""
     damage(published)
     if "changed" in said:
         for use in (store.load_whole, lambda slot: store.publish(slot, records(), write, {})):

@@ -88,10 +88,8 @@ def made(folder: Path, *lines: str, **options: Any) -> LockFile:
 def test_a_lock_has_every_package_with_its_files(
     index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What the repository needs and what the worker imports; uv itself installs from it.
-
-    A file that was replaced on the index is told; a further one for the same version is no drift.
-    """
+    """What the repository needs and what the worker imports; uv itself installs from it. A file
+    that was replaced on the index is told; a further one for the same version is no drift."""
     make_wheel(index.folder, "wanted")
     lock = made(tmp_path / "repo", "wanted")
     assert {one.name: one.version for one in lock.packages} == {**WORKERS, "wanted": "1.0"}

@@ -137,10 +137,8 @@ def test_all_are_made_where_none_was_there(rooms: dict[str, Room]) -> None:
 
 
 def test_what_many_places_run_on_has_a_name_of_a_file(rooms: dict[str, Room]) -> None:
-    """It is looked up as one; the same places have the same, in any order.
-
-    What places run on that are alike is that of one: a remembered manifest then holds for both.
-    """
+    """It is looked up as one; the same places have the same, in any order. What places run on that
+    are alike is that of one: a remembered manifest then holds for both."""
     assert _opened(["a", "b"]).runs_on(Runtime("")) == Runtime("")
     names = [f"far{number}" for number in range(300)]
     found = [_opened(some).runs_on(Runtime("")) for some in (names, names[::-1], names[1:])]

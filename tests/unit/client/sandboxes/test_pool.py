@@ -133,8 +133,7 @@ def test_all_are_ended_at_exit_and_none_is_kept(pool: Pool) -> None:
 
 def test_a_fork_has_servers_of_its_own(pool: Pool) -> None:
     """Its parent's stay as they are, in use and idle, and it waits for no lock of another thread:
-    of one that its parent has, nor of one of its own.
-    """
+    of one that its parent has, nor of one of its own."""
     ours, idle = [pool.acquire("key", Server)], given_up(pool, "idle", 600)
     server = ours[0].server
     held, done = threading.Event(), threading.Event()
@@ -210,10 +209,8 @@ def test_an_interrupted_release_is_finished_by_the_next(then: str) -> None:
 
 
 def test_its_time_comes(pool: Pool) -> None:
-    """It is ended once, in the background, and the thread that did it ends, too.
-
-    One is kept at most: with the next its time has come, however long it was.
-    """
+    """It is ended once, in the background, and the thread that did it ends, too. One is kept at
+    most: with the next its time has come, however long it was."""
     server = given_up(pool, "key", 0.01)
     assert eventually(lambda: server.ends == ["envhub-idle"])
     assert eventually(lambda: not waiting())
@@ -225,10 +222,8 @@ def test_its_time_comes(pool: Pool) -> None:
 
 @pytest.mark.parametrize("idle_s", [600, None])
 def test_an_idle_one_that_has_died_is_ended_by_the_next(pool: Pool, idle_s: float | None) -> None:
-    """And not when its time has come: until it is waited for, it is a zombie.
-
-    One that has died in use is ended by the one who gives it back.
-    """
+    """And not when its time has come: until it is waited for, it is a zombie. One that has died in
+    use is ended by the one who gives it back."""
     dead = given_up(pool, "key", idle_s)
     dead.runs = False
     fresh = pool.acquire("key", Server, idle_s)

@@ -152,10 +152,8 @@ locks: list[LifeLock] = []
 def test_a_containers_folder_is_left_behind_when_its_client_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No process holds the lock of its client; without one nothing can be told.
-
-    A name in a folder that everybody may write proves nothing: no link is followed.
-    """
+    """No process holds the lock of its client; without one nothing can be told. A name in a folder
+    that everybody may write proves nothing: no link is followed."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     folder(elsewhere, "data", {"alive": ""})

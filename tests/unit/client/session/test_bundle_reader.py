@@ -276,10 +276,8 @@ def test_a_replay_asks_the_same(tmp_path: Path) -> None:
 
 
 def test_a_bundle_cannot_call_the_proxy_itself(tmp_path: Path) -> None:
-    """A name is the jail's business alone; so is a sub-environment, of those that there are.
-
-    Nor is a name what is asked: a call of ``reset`` is no reset of all of them.
-    """
+    """A name is the jail's business alone; so is a sub-environment, of those that there are. Nor is
+    a name what is asked: a call of ``reset`` is no reset of all of them."""
     folder = bundle(tmp_path)
     calls: list[m.Message] = [
         *(m.CallOwn(0, "close", (), {}), m.GetOwn(0, "__dict__")),

@@ -69,8 +69,7 @@ def test_backoff_doubles_and_is_bounded() -> None:
 
 def test_a_step_of_all_is_one_step() -> None:
     """Its time is that of the slowest; deaths, restarts and bytes are added up. A straggler is the
-    worker that was waited for most.
-    """
+    worker that was waited for most."""
     parts = [Counters() for _ in range(3)]
     counters = FleetCounters(parts)
     counters.requests += 1

@@ -1,7 +1,5 @@
-"""What may be an asset: a repository of the Hub, once, and by a card's word a commit only.
-
-A card is read as data, within bounds, and only in one form.
-"""
+"""What may be an asset: a repository of the Hub, once, and by a card's word a commit only. A card
+is read as data, within bounds, and only in one form."""
 
 from pathlib import Path
 from typing import Any

@@ -50,10 +50,8 @@ def test_what_is_committed_counts_wherever_it_lies(repository: GitRepository) ->
 def test_what_git_ignores_is_left_out_unless_it_is_committed(
     repository: GitRepository, tmp_path: Path
 ) -> None:
-    """Also what only its user ignores, here; what git was made to add counts all the same.
-
-    What was deleted counts no more, and a worktree, whose ``.git`` is a file, is as good.
-    """
+    """Also what only its user ignores, here; what git was made to add counts all the same. What was
+    deleted counts no more, and a worktree, whose ``.git`` is a file, is as good."""
     folder = repository.folder
     repository.commit({"gone.py": ""})
     (folder / "gone.py").unlink()

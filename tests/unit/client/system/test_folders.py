@@ -42,10 +42,8 @@ def mode(path: Path) -> int:
 
 @pytest.mark.parametrize("mask", UMASKS)
 def test_modes_do_not_follow_the_umask(tmp_path: Path, mask: int) -> None:
-    """A shared folder is 0755 and a private one 0700, with every folder above it 0755.
-
-    Manifests are nobody else's: neither the folder nor what is in it.
-    """
+    """A shared folder is 0755 and a private one 0700, with every folder above it 0755. Manifests
+    are nobody else's: neither the folder nor what is in it."""
     with umask(mask):
         folders.make(tmp_path / "a" / "b")
         folders.make_private(tmp_path / "c" / "d")

@@ -1,7 +1,5 @@
 """What stands in on macOS and Windows for what Linux alone has, and which names are others there.
-
-``tests/attacks/files/test_names.py`` has what the names are for.
-"""
+``tests/attacks/files/test_names.py`` has what the names are for."""
 
 import configparser
 import json
@@ -136,10 +134,8 @@ parser.main()
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_every_module_can_be_imported(system: str) -> None:
     """And none of them imports what only Linux uses, which is not there; the control finds it here.
-
-    A folder with a drive is here on Windows, where no program starts without some variables; of
-    the others of the environment nothing is handed on.
-    """
+    A folder with a drive is here on Windows, where no program starts without some variables; of the
+    others of the environment nothing is handed on."""
     alone = interpreter.LINUX_ALONE
     for text in _GONE[system]:
         exec(text, {"__name__": "envhub_sandbox.pretended"})
@@ -176,10 +172,8 @@ def test_this_platform_is_linux() -> None:
 
 
 def test_locks_hold_between_processes_on_windows(tmp_path: Path) -> None:
-    """And are given back by the end of the one that had them; what a file holds can be read.
-
-    On macOS they are those of Linux, which ``test_locks`` has.
-    """
+    """And are given back by the end of the one that had them; what a file holds can be read. On
+    macOS they are those of Linux, which ``test_locks`` has."""
 
     def started(program: str) -> subprocess.Popen[str]:
         pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}

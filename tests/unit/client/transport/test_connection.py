@@ -114,10 +114,8 @@ def test_a_frame_over_the_limit_does_not_arrive() -> None:
 
 
 def test_other_replies_are_dropped_while_one_is_looked_for() -> None:
-    """As many as there are, and counted; the one that follows them is found.
-
-    At each look one of them at most: a flood has no end, and a deadline holds in it.
-    """
+    """As many as there are, and counted; the one that follows them is found. At each look one of
+    them at most: a flood has no end, and a deadline holds in it."""
     dropped = [0]
 
     def flood(asked: Asked) -> list[Frames]:

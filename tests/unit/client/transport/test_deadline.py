@@ -1,7 +1,4 @@
-"""Whether to wait awake is decided by what was measured.
-
-Which shard runs on which core.
-"""
+"""Whether to wait awake is decided by what was measured. Which shard runs on which core."""
 
 import math
 import os
@@ -46,10 +43,8 @@ def test_a_change_of_load_is_noticed() -> None:
 
 
 def test_waits_in_vain_end_spinning_at_once() -> None:
-    """A core that somebody else takes does not cost the rest of a long interval.
-
-    The budget follows what awake steps take: a reply that is long overdue is waited for asleep.
-    """
+    """A core that somebody else takes does not cost the rest of a long interval. The budget follows
+    what awake steps take: a reply that is long overdue is waited for asleep."""
     chooser = SpinChooser(True)
     run(chooser, 10_000, awake_ns=50_000, asleep_ns=90_000)
     assert chooser.budget_ns == 150_000
@@ -106,8 +101,7 @@ def test_a_program_may_keep_to_fewer_cores_after_its_imports(
 @pytest.mark.parametrize("timeout_s", [None, -5.0, 1e6, 1e30, 1e308, math.inf])
 def test_any_deadline_can_be_waited_for(kind: type[Deadline], timeout_s: float | None) -> None:
     """None never comes. What is left is never negative; a wait is at least a millisecond, and even
-    infinity has milliseconds that poll() takes: who waits asks again afterwards.
-    """
+    infinity has milliseconds that poll() takes: who waits asks again afterwards."""
     deadline = kind(timeout_s)
     assert deadline.passed == (timeout_s == -5.0)
     left_s, left_ms = deadline.left_s(), deadline.left_ms()

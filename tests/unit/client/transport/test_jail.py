@@ -106,8 +106,7 @@ def found(lanes: list[FakeLane], timeout_s: float | None) -> list[int]:
 
 def test_who_has_answered_is_found_at_once(lanes: list[FakeLane]) -> None:
     """All of them, in order, also where the deadline has passed; nothing is listened to. A deadline
-    ends the wait for others.
-    """
+    ends the wait for others."""
     lanes[0].silent = lanes[2].silent = False
     assert found(lanes, 0) == [0, 2]
     assert found(lanes, None) == [0, 2]

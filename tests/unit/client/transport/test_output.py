@@ -25,10 +25,8 @@ def lines_of(*chunks: bytes) -> list[str]:
 
 
 def test_lines_are_cut_at_every_end() -> None:
-    """Carriage returns count, for progress bars; the last line need not be ended.
-
-    Escape sequences and broken encodings become visible text; a line without end is cut.
-    """
+    """Carriage returns count, for progress bars; the last line need not be ended. Escape sequences
+    and broken encodings become visible text; a line without end is cut."""
     assert lines_of(b"a\nb\r\nc\rd") == ["a", "b", "c", "d"]
     assert lines_of(b"one ", b"line\nand", b" another") == ["one line", "and another"]
     assert lines_of(b"\x1b[31mred\x07\n\xff\xfe\n") == ["\\x1b[31mred\\x07", "\\xff\\xfe"]
@@ -126,8 +124,7 @@ def test_stderr_gets_lines_as_it_is_now(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A notebook puts another in its place, and what takes nothing hurts nobody. It takes no more
-    than a file: somebody keeps what our program prints, and a worker may print for ever.
-    """
+    than a file: somebody keeps what our program prints, and a worker may print for ever."""
     monkeypatch.setattr(output, "FILE_BYTES", 30)
     [sink] = OutputSinks("repo", None, stderr=True).sinks
     sink("hello")

@@ -100,10 +100,8 @@ def test_another_number_of_cores_is_another_machine(
 
 
 def test_what_may_share_state_stays_together(path: Path) -> None:
-    """A SyncVectorEnv's sub-environments live in one process, and so does what is no such env.
-
-    A number of workers is kept, whatever was measured, if there are as many sub-environments.
-    """
+    """A SyncVectorEnv's sub-environments live in one process, and so does what is no such env. A
+    number of workers is kept, whatever was measured, if there are as many sub-environments."""
     use(path, {"8+8": 1e-3})
     trials = ShardTrials(path)
     assert trials.bounds_for(environment(16, sync=True), None) == [(0, 16)]

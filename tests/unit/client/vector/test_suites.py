@@ -134,10 +134,8 @@ def test_no_more_live_than_were_asked_for(live: int) -> None:
 
 
 def test_several_are_played_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each waits for two others, so that one after the other would never end.
-
-    Those of sandbox=None, without processes, have nothing that could be started ahead.
-    """
+    """Each waits for two others, so that one after the other would never end. Those of
+    sandbox=None, without processes, have nothing that could be started ahead."""
     barrier = threading.Barrier(3)
     TaskMap(_suites(6), lambda *_: barrier.wait(DEADLINE_S), 4).run()
     monkeypatch.delattr(_Task, "prewarm")

@@ -145,8 +145,7 @@ def test_hostile_description_is_cleaned_by_the_receiver() -> None:
 
 def test_what_is_looked_at_is_never_borrowed() -> None:
     """Flags, and what a thing is described by, are copies; the control, an array, lies where its
-    frame does. Whoever sent them may still write there.
-    """
+    frame does. Whoever sent them may still write there."""
     large = np.zeros(20_000)
     sent = [large, large.astype(bool), object()]
     frames = encode(sent, describer=lambda _: (GENERATOR, {"keys": (large,)}))

@@ -1,7 +1,5 @@
-"""What the caller hands over arrives as it is, of exactly its type.
-
-What cannot be sent of a reply arrives as a description, and the rest as it is.
-"""
+"""What the caller hands over arrives as it is, of exactly its type. What cannot be sent of a reply
+arrives as a description, and the rest as it is."""
 
 import functools
 import threading

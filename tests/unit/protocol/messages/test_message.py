@@ -1,7 +1,5 @@
-"""Frames of a message, and the number in front of a header.
-
-Messages that recur are unpacked by their form: nobody may notice.
-"""
+"""Frames of a message, and the number in front of a header. Messages that recur are unpacked by
+their form: nobody may notice."""
 
 import sys
 import tracemalloc

@@ -1,7 +1,5 @@
 """Doorbells: who rings never waits, and a ring that came before the wait counts.
-
-``tests/attacks/protocol/test_slabs.py`` has the memory beside them.
-"""
+``tests/attacks/protocol/test_slabs.py`` has the memory beside them."""
 
 import os
 import select

@@ -21,14 +21,8 @@ def host(
     minors: dict[str, int] | None = None,
     renders: dict[str, str] | None = None,
 ) -> HostFiles:
-    """A host with these nodes.
-
-    Args:
-        dev: Names in /dev.
-        dri: Names in /dev/dri.
-        minors: PCI address to number, as NVIDIA's driver says it.
-        renders: Name of a render node to the folder of its device.
-    """
+    """A host with these nodes in /dev and /dev/dri; NVIDIA's driver gives minor numbers to PCI
+    addresses, and render nodes have folders of devices."""
     listings = {
         "/dev": dev.split(),
         "/dev/dri": dri.split(),

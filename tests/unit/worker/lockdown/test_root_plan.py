@@ -64,8 +64,7 @@ def test_interpreter_appears_where_it_is() -> None:
 @pytest.mark.parametrize("path", ["/", "/home", "/home/ann", "/run", "/run/envhub", "/all"])
 def test_interpreter_cannot_open_a_home(path: str) -> None:
     """A sys.path entry at or above a home is left out, or one that leads there; a project below it
-    is not.
-    """
+    is not."""
     assert root(interpreter=(path, "/home/ann/proj")).trees == (
         "/etc/fonts",
         "/home/ann/proj",

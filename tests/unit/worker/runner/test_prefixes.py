@@ -1,7 +1,5 @@
-"""What the runner hears of warnings: each text once, bounded, fit to be printed.
-
-What a runner watches: plain values of plain attributes; and that nothing changes unnoticed.
-"""
+"""What the runner hears of warnings: each text once, bounded, fit to be printed. What a runner
+watches: plain values of plain attributes; and that nothing changes unnoticed."""
 
 import io
 import threading

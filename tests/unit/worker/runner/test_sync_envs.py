@@ -50,8 +50,7 @@ class Fails(gym.Env[Any, Any]):
 )
 def test_it_goes_on_after_a_failure_as_gymnasium_does(failing: str, mode: str) -> None:
     """An autoreset that raises leaves the last observation; a step whose infos cannot be joined
-    leaves no episode that has ended.
-    """
+    leaves no episode that has ended."""
     ours = SubEnvs([Fails, Fails], mode, sync=True)
     theirs = SyncVectorEnv([Fails, Fails], autoreset_mode=AutoresetMode(mode))
     ours.run_reset(None, None, None)

@@ -1,7 +1,5 @@
-"""The layout of a jail's cache of the Hub, as huggingface_hub reads it.
-
-The stub of LeRobot: the names of its contract, and only where it is not installed.
-"""
+"""The layout of a jail's cache of the Hub, as huggingface_hub reads it. The stub of LeRobot: the
+names of its contract, and only where it is not installed."""
 
 import dataclasses
 import importlib
@@ -100,8 +98,7 @@ def test_lerobot_itself_is_imported_for_what_the_stub_lacks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither for the stub's names nor for a caller's configuration, which counts as what it is in
-    LeRobot once that is there; and without a warning, since LeRobot is installed.
-    """
+    LeRobot once that is there; and without a warning, since LeRobot is installed."""
     for package in ("lerobot", "lerobot/envs"):
         (tmp_path / package).mkdir()
         (tmp_path / package / "__init__.py").write_text("__version__ = '9'\n")

@@ -74,10 +74,8 @@ def processes_that_mention(text: str) -> list[int]:
 
 
 def test_runner_has_private_home_and_shows_the_snapshot(cell: Cell) -> None:
-    """HOME, TMPDIR and the working directory are the jail's own; the snapshot shows through.
-
-    No other user of the host may enter them, where they lie in its folders, or put others there.
-    """
+    """HOME, TMPDIR and the working directory are the jail's own; the snapshot shows through. No
+    other user of the host may enter them, where they lie in its folders, or put others there."""
     source = """
 import os, tempfile
 open('new.txt', 'w').write('x')

@@ -38,10 +38,8 @@ def told_of(jail: Any) -> Iterator[tuple[JailEvents, JailRecord, Mock, list[Any]
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_what_a_jail_was_denied_is_known_when_it_is_ended(fails: bool) -> None:
-    """Also if what ends it is heard of first, on another descriptor; and it dies of that.
-
-    Its last words may be lost, as where its server has no descriptors left; that goes on.
-    """
+    """Also if what ends it is heard of first, on another descriptor; and it dies of that. Its last
+    words may be lost, as where its server has no descriptors left; that goes on."""
     jail = Mock()
     jail.poll.return_value = [
         CallDenied("socket", "AF_INET"),

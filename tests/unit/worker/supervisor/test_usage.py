@@ -1,7 +1,5 @@
 """What a server counts of its jails, how often, and which limits it says that they have come to.
-
-Here with this process for a runner.
-"""
+Here with this process for a runner."""
 
 import os
 import subprocess

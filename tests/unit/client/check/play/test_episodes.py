@@ -26,10 +26,8 @@ MODES = ["NextStep", "SameStep", "Disabled"]
 
 
 class Scripted(gym.Env[Any, Any]):
-    """Episodes of seeded lengths; sub-environment ``index`` earns ``index + 1`` a step.
-
-    Every third episode is a success; a reset earns a reward that must never be counted.
-    """
+    """Episodes of seeded lengths; sub-environment ``index`` earns ``index + 1`` a step. Every third
+    episode is a success; a reset earns a reward that must never be counted."""
 
     observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
     action_space = gym.spaces.Discrete(2)

@@ -29,12 +29,7 @@ _SERVES = f"echo 'WARNING: something that engines say' >&2; {_ANNOUNCES}; cat >/
 
 @dataclass
 class Kept:
-    """A monitor that runs, and its client.
-
-    Attributes:
-        said: The document that it wrote.
-        log: What the engine was called with, a line a call.
-    """
+    """A monitor that runs, the document that it wrote, and the log of calls of its engine."""
 
     monitor: subprocess.Popen[bytes]
     client: subprocess.Popen[bytes]

@@ -1,7 +1,5 @@
-"""Which files a waiting call asks for, read out of memory: here, out of this process's own.
-
-And whether one is about a process of the jail's own: here, this process's children.
-"""
+"""Which files a waiting call asks for, read out of memory: here, out of this process's own. And
+whether one is about a process of the jail's own: here, this process's children."""
 
 import ctypes
 import mmap

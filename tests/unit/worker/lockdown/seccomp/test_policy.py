@@ -287,10 +287,8 @@ def test_memory_out_of_sight_is_denied_where_it_is_measured(machine: str) -> Non
 def test_what_is_recorded_is_denied_all_the_same(
     machine: str, network: str, namespaced: bool
 ) -> None:
-    """Whatever is asked of init is what would have been refused, and init refuses it likewise.
-
-    With one exception: what would have been permitted whatever its arguments, and is only seen.
-    """
+    """Whatever is asked of init is what would have been refused, and init refuses it likewise. With
+    one exception: what would have been permitted whatever its arguments, and is only seen."""
     plain = policy_table(namespaced=namespaced, network=network)
     asking, seen = recorded_calls(plain, NUMBERS[machine]), watched_calls(plain)
     assert seen == watched_calls(
