@@ -33,18 +33,15 @@ def test_what_a_stranger_writes_is_text_in_every_form(text: str) -> None:
     told = line.split("::", 2)[2].replace("%0A", "\n").replace("%25", "%")  # as GitHub reads it
     assert told.startswith(f"{made.findings[0].message}\n")
     assert line.count("::") == 2 + text.replace("\r", "").count("::")
-
     table = reports.summary(made, made.findings).splitlines()
     [row] = [line for line in table if line.startswith("| **fails**")]
     assert row.count("|") == 5, "one row of four cells"
     assert not set("<>[]!`") & set("".join(table)), "nothing is a tag, a link or an image"
-
     suite = ElementTree.fromstring(reports.junit(made, made.findings))
     assert (suite.attrib["tests"], suite.attrib["failures"]) == ("2", "1")
     assert [case.attrib["name"] for case in suite] == ["runs", "loads"]
     [failure] = suite.findall("testcase/failure")
     assert failure.text
-
     [run] = json.loads(reports.sarif(made, made.findings))["runs"]
     assert [rule["id"] for rule in run["tool"]["driver"]["rules"]] == list(CHECKS)
     place = run["results"][0]["locations"][0]["physicalLocation"]

@@ -101,7 +101,6 @@ def test_a_lock_has_every_package_with_its_files(
     command += ["--target", str(target), "-r", str(path)]
     uv.run(command, what="the lock is none", timeout_s=300)
     assert (target / "wanted/__init__.py").is_file()
-
     make_wheel(index.folder, "wanted", tag="py2.py3-none-any")
     assert making.differences(lock, making.relisted(lock)) == []
     make_wheel(index.folder, "wanted", files={"wanted/__init__.py": "evil = 1\n"})

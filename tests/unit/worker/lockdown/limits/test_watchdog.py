@@ -61,7 +61,6 @@ def test_hierarchy_is_found(mounts: str, own: str, root: bool, found: Hierarchy 
 
 def test_v2_tree_enables_and_sets_limits(tmp_path: Path) -> None:
     (tmp_path / "cgroup.subtree_control").write_text("memory")
-
     real = os.mkdir
 
     def mkdir(path: str, mode: int = 0o777) -> None:
