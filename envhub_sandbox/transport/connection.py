@@ -36,24 +36,24 @@ _NOW = int(zmq.NOBLOCK)
 _MORE_NOW = int(zmq.SNDMORE) | _NOW
 _EVENTS, _READABLE = int(zmq.EVENTS), int(zmq.POLLIN)
 _KILLED_IN_A_CONTAINER = 128
-"""Added to a signal's number, this is an engine's exit code for a container that was killed."""
+"""A container engine adds this to the signal's number: the exit code of a killed container."""
 _SIGKILL = 9
 SESSION = secrets.token_bytes(16)
 Source = Any
-"""What can be polled for input: a descriptor, or a ZeroMQ socket."""
+"""A descriptor or a ZeroMQ socket, which can be polled for input."""
 _Received = tuple[m.Message, list[Buffer]]
 _MOST_SOCKETS = 8192
-"""A connection over a network has three; by default there may be some 300 of these."""
+"""A connection over a network has three sockets; ZeroMQ's default allows some 300 connections."""
 _contexts: dict[int, zmq.Context[zmq.Socket[bytes]]] = {}
 
 
 def remote_session_id() -> bytes:
-    """Our session on other hosts, where a fork of this process is another client."""
+    """Our session's id on other hosts, to which a fork of this process is another client."""
     return SESSION + os.getpid().to_bytes(4, "little")
 
 
 def _context() -> zmq.Context[zmq.Socket[bytes]]:
-    """This process's ZeroMQ context: one that came through a fork cannot be used."""
+    """This process's ZeroMQ context; a fork makes its own, as it cannot use its parent's."""
     pid = os.getpid()
     if pid not in _contexts:
         _contexts.clear()
@@ -77,25 +77,25 @@ class FarServer(Protocol):
 
     @property
     def why_ended(self) -> Callable[[], str]:
-        """Says what is known of its end, as the rest of a sentence; may wait some seconds."""
+        """Returns why the server has ended, as the rest of a sentence; may wait some seconds."""
 
     def link(self, socket: zmq.Socket[bytes], endpoint: str) -> Any:
         """A ``TcpLink``, which watches a socket before it connects."""
 
 
 class WorkerConnection:
-    """A connection. Not thread-safe: its owner holds a lock.
+    """A connection to one worker server. Not thread-safe: its owner holds a lock.
 
     Args:
         endpoint: The server's ZeroMQ endpoint.
         process_fd: A descriptor that becomes readable when the server's process ends.
         limits: Bounds on what the server may send.
-        far: The server's key and ours, where it is on another host.
+        far: The server's key and ours, if the server is on another host.
 
     Attributes:
-        patience_s: How long the server keeps the jails of a client that says nothing; 0: for ever.
-        torn: Whether an interrupt may have left half a message, which the next would be taken into;
-            or taken a reply that ``arrived`` has not kept.
+        patience_s: How long the server keeps the jails of a silent client; 0: for ever.
+        torn: Whether an interrupt may have left half a message in the socket, to which the next
+            message would be added, or may have lost a reply that ``arrived`` was reading.
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class WorkerConnection:
         request_id = next(self._ids)
         operation = getattr(message, "operation", "")
         MESSAGES.debug("> %d %s %s", request_id, type(message).__name__, operation)
-        if message is not self._packed[0]:  # a step's is the same each time
+        if message is not self._packed[0]:  # all steps send the same message object
             self._packed = message, m.pack(message)
         header, *buffers = self._packed[1]
         self._send(request_id, [m.with_id(header, request_id), *buffers, *payload])
@@ -188,12 +188,13 @@ class WorkerConnection:
         self.sent_bytes += size
 
     def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Buffer]]:
-        """The reply to a request, with its payload. Other replies are dropped and counted, unless
-        ``keep`` was called for them.
-        Raises ``WorkerTimeoutError``: the deadline came first, and a reply that still comes is
-        dropped; ``WorkerDiedError``: the worker server has ended, or the connection to it is lost;
+        """Wait for the reply to a request; returns it with its payload.
+
+        Other replies are dropped and counted, unless ``keep`` was called for their requests.
+        Raises ``WorkerTimeoutError``: the deadline came first, and a late reply is dropped;
+        ``WorkerDiedError``: the worker server has ended, or the connection to it is lost;
         ``SandboxUnavailableError``: a server on another host does not let us in;
-        ``RemoteProtocolError``: what came is not a reply.
+        ``RemoteProtocolError``: the message that came is not a reply.
         """
         self.check_process()
         while True:
@@ -227,11 +228,11 @@ class WorkerConnection:
             else:
                 self._sent.pop(reply_id, None)
                 self.stale_replies += 1
-            if deadline.passed:  # a flood of these would be waited for without end
+            if deadline.passed:  # a flood of other replies must not extend the wait
                 raise WorkerTimeoutError("the worker did not answer in time")
 
     def arrived(self, request_id: int) -> bool:
-        """Whether ``receive`` has its reply, or raises why there is none. Never waits."""
+        """Whether ``receive`` would return or raise at once. Never waits."""
         if request_id not in self._arrived:
             try:
                 if not self._is_readable(request_id, 0):
@@ -247,12 +248,12 @@ class WorkerConnection:
         return True
 
     def peek(self, request_id: int) -> tuple[m.Message | None, list[Buffer]]:
-        """The reply that has ``arrived``, which stays there for ``receive``; None for an error."""
+        """The reply that has ``arrived``, without removing it; None if an error has arrived."""
         arrived = self._arrived.get(request_id)
         return (None, []) if arrived is None or isinstance(arrived, EnvHubError) else arrived
 
     def keep(self, request_id: int) -> None:
-        """Keep the reply to this request, if it comes before another one that is waited for."""
+        """Keep the reply to this request if it arrives while another reply is waited for."""
         self._kept.add(request_id)
 
     def forget(self, request_id: int) -> None:
@@ -261,12 +262,13 @@ class WorkerConnection:
         self._arrived.pop(request_id, None)
 
     def sources(self) -> list[Source]:
-        """To be polled for input before ``arrived`` is asked again, at least twice a second."""
+        """What to poll for input before the next call of ``arrived``, at least twice a second."""
         return [source for source, _ in self._poller.sockets]
 
     def reply_again(self, request_id: int, deadline: Deadline) -> m.Message:
-        """The reply to a request whose wait was interrupted, before or after it came, without its
-        payload; raises as ``receive`` does.
+        """The reply, without payload, to a request whose wait was interrupted.
+
+        It may have been read before the interrupt. Raises as ``receive`` does.
         """
         if self._latest:
             reply_id, reply = m.unpack_header(self._latest, limits=self._limits)
@@ -278,13 +280,13 @@ class WorkerConnection:
         deadline: Deadline | None = None
         while True:
             try:
-                # one by one: pyzmq's own loop costs more than the calls in it
+                # frame by frame: pyzmq's own loop costs more than the calls in it
                 self.torn = True  # interruption.md, rule 1
                 for frame in frames[:-1]:
                     self._socket.send(frame, _MORE_NOW, copy)
                 self._socket.send(frames[-1], _NOW, copy)
                 self.torn = False
-            except zmq.Again:  # nothing of the message is left in the socket
+            except zmq.Again:  # the socket took no frame of the message, so all are sent again
                 self.torn = False
                 deadline = deadline or Deadline(_ROOM_S)
                 self._wait_for_room(deadline)
@@ -310,7 +312,7 @@ class WorkerConnection:
         return WorkerDiedError(text, reason="server")
 
     def _take(self) -> list[Buffer]:
-        """Read the message. Large frames stay in ZeroMQ's memory until they are decoded."""
+        """Read one message. Large frames stay in ZeroMQ's memory until they are decoded."""
         frames: list[Buffer] = []
         more = True
         while more:
@@ -326,13 +328,13 @@ class WorkerConnection:
 
     def _wait(self, request_id: int, deadline: Deadline) -> None:
         if int(self._socket.getsockopt(_EVENTS)) & _READABLE:
-            return  # as where several workers step side by side: a poll costs more than that
+            return  # often so with several workers; this look costs less than a poll
         while not self._is_readable(request_id, self._wait_ms(deadline)):
             if deadline.passed:
                 raise WorkerTimeoutError("the worker did not answer in time")
 
     def _is_readable(self, request_id: int, wait_ms: int | None) -> bool:
-        """Whether there is a message; raises the error if no reply to this request can come."""
+        """Whether a message is there; raises the error if no reply to this request can come."""
         ready = dict(self._poller.poll(wait_ms))
         if self._socket in ready:
             return True
@@ -349,7 +351,7 @@ class WorkerConnection:
         return _LOOK_MS if left is None else min(left, _LOOK_MS)
 
     def hold(self, jail: int) -> None:
-        """Name a jail on another host in keep-alive messages from now on."""
+        """Name the jail in keep-alive messages from now on, if the server is on another host."""
         if self._far is not None:
             self._far.held.add(jail)
 
@@ -372,12 +374,12 @@ class WorkerConnection:
 
 
 def describe_exit(process_fd: int) -> str:
-    """How a server ended and what to do, as the rest of a sentence. The process stays to be reaped.
-    ``process_fd``: a pidfd of it, or of the monitor of its container.
+    """How a server ended and what to do, as the rest of a sentence. Does not reap the process.
+    ``process_fd``: a pidfd of the server, or of its container's monitor.
     """
     how = ""
     if sys.platform == "linux":
-        with contextlib.suppress(OSError):  # it was reaped already, or it is no process
+        with contextlib.suppress(OSError):  # the process was reaped already, or this is no pidfd
             status = os.waitid(os.P_PIDFD, process_fd, os.WEXITED | os.WNOHANG | os.WNOWAIT)
             if status is not None:
                 killed = status.si_code in (os.CLD_KILLED, os.CLD_DUMPED)

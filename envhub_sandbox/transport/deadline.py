@@ -1,17 +1,17 @@
 """How long to wait: one deadline per operation, and whether to wait awake for a reply.
 
-A deadline is made once and passed down, and asked for what is left at each wait.
+An operation makes its deadline once and passes it down; each wait asks it for the time left.
 
-A wake-up costs some ten microseconds, so a reply that is nearly there is best waited for awake.
-With every core busy the same spinning takes the core from the runner that computes the reply. So
-both ways are tried in turn, seldom, and the faster one is used; the interval between trials doubles
-while the answer stays the same. One decision serves both sides: the client's wait for the reply
-and the runner's wait for the next request.
+To wait awake is to spin on the slab. A wake-up from sleep costs some ten microseconds, so spinning
+is faster if the reply comes soon. If every core is busy, spinning takes the core from the runner
+that computes the reply. So ``SpinChooser`` seldom tries both ways in turn and uses the faster one;
+the interval between trials doubles while the result stays the same. One decision serves both
+sides: the client's wait for the reply and the runner's wait for the next request.
 
-One core is the client's. The shards that get cores of their own may wait for work awake; one that
-finds none sleeps until it is asked, and runs on the client's core while the client sleeps. Left
-alone, the kernel tends to wake shards on the core of the process that woke them, and they run one
-after the other. So each keeps to a core.
+One core is the client's. A shard with a core of its own may wait awake for work. A shard without
+one sleeps until a request comes, and runs on the client's core while the client sleeps. By itself
+the kernel tends to wake shards on the core of the process that woke them, so that they run one
+after the other. So ``Cores`` assigns each shard to a core.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import os
 from time import monotonic
 
 _LONGEST_WAIT_MS = 24 * 3600 * 1000
-"""One wait; who waits asks again afterwards. Infinity has no milliseconds."""
+"""The longest single wait; after it the caller waits again. Infinity has no milliseconds."""
 
 _LOOK_AGAIN_MS = 100
 
@@ -30,13 +30,13 @@ class Deadline:
     """A point in time. ``Deadline(None)`` never comes.
 
     Attributes:
-        timeout_s: How far away it was.
+        timeout_s: The seconds from its creation until it comes.
     """
 
     __slots__ = ("_at", "timeout_s")
 
     unasked = False
-    """Whether it is for work in advance, which no request waits for."""
+    """Whether the work is done in advance, and no request waits for it."""
 
     def __init__(self, timeout_s: float | None) -> None:
         self.timeout_s = timeout_s
@@ -47,13 +47,13 @@ class Deadline:
         return None if self._at is None else max(0.0, self._at - monotonic())
 
     def left_ms(self) -> int | None:
-        """Milliseconds until it comes, rounded up, or a day; None for never."""
+        """Milliseconds until it comes, rounded up, at most a day; None for never."""
         left = self.left_s()
         return None if left is None else int(min(left * 1000 + 1, _LONGEST_WAIT_MS))
 
     def postpone(self, seconds: float) -> None:
         """Extend the deadline by ``seconds``."""
-        if self._at:  # 0 has been given up
+        if self._at:  # 0 means that ``give_up`` was called
             self._at += seconds
 
     @property
@@ -63,7 +63,7 @@ class Deadline:
 
 
 class PartDeadline(Deadline):
-    """So much of what is left of another deadline, which also ends it."""
+    """A share of the time left of another deadline; it also ends when that deadline passes."""
 
     __slots__ = ("_whole",)
 
@@ -73,30 +73,30 @@ class PartDeadline(Deadline):
         self._whole = whole
 
     def left_ms(self) -> int | None:
-        """As the other: its waits may be short."""
+        """Milliseconds until the earlier of both deadlines; None for never."""
         left = (super().left_ms(), self._whole.left_ms())
         return min((seconds for seconds in left if seconds is not None), default=None)
 
     @property
     def passed(self) -> bool:
-        """Whether one of them has come."""
+        """Whether one of both deadlines has come."""
         return super().passed or self._whole.passed
 
 
 def deadline_of(timeout: float | Deadline | None) -> Deadline:
-    """A deadline so many seconds from now; one that several waits share is given as it is."""
+    """A deadline ``timeout`` seconds from now; a ``Deadline`` is returned unchanged."""
     return timeout if isinstance(timeout, Deadline) else Deadline(timeout)
 
 
 class StepDeadline(Deadline):
-    """A deadline that serves every step, and counts from its first wait.
+    """A deadline that is reused for every step, and counts from the step's first wait.
 
-    Most replies are there before a wait has to sleep, and to make a deadline and read the clock
-    for it costs more than one per cent of a short step. How long a lane waits awake before it asks
+    Most replies are there before a wait has to sleep, and a new deadline with a reading of the
+    clock costs more than one per cent of a short step. The time that a lane waits awake before
     (a fraction of a millisecond) does not count.
 
     Attributes:
-        running: Whether it counts already; False when the next step begins.
+        running: Whether it counts already; the caller sets it to False for each step.
     """
 
     __slots__ = ("running",)
@@ -106,13 +106,13 @@ class StepDeadline(Deadline):
         self.running = False
 
     def left_s(self) -> float | None:
-        """As ``Deadline``; the first time it starts to count."""
+        """As in ``Deadline``; the first call of a step starts the clock."""
         self._run()
         return super().left_s()
 
     @property
     def passed(self) -> bool:
-        """As ``Deadline``; the first time it starts to count."""
+        """As in ``Deadline``; the first call of a step starts the clock."""
         self._run()
         return super().passed
 
@@ -123,7 +123,7 @@ class StepDeadline(Deadline):
 
 
 class StartupDeadline(Deadline):
-    """A deadline that another thread can bring forward: its waits are short."""
+    """A deadline that another thread can end early, so each single wait is short."""
 
     __slots__ = ("unasked",)
 
@@ -132,12 +132,12 @@ class StartupDeadline(Deadline):
         self.unasked = unasked
 
     def give_up(self) -> None:
-        """It has come."""
+        """End the deadline now; the work is not in advance any more."""
         self.unasked = True
         self._at = 0.0
 
     def left_ms(self) -> int:
-        """Milliseconds until the next look; at most ``_LOOK_AGAIN_MS``."""
+        """Milliseconds until it comes, at most ``_LOOK_AGAIN_MS``."""
         left = super().left_ms()
         return _LOOK_AGAIN_MS if left is None else min(left, _LOOK_AGAIN_MS)
 
@@ -149,16 +149,16 @@ _TRIAL = 16
 _FIRST_INTERVAL = 64
 _LONGEST_INTERVAL = 8192
 _MAX_BUDGET_NS = 400_000
-"""A reply that is further away than this is not worth waiting awake for."""
+"""The longest wait awake; for later replies sleep costs little in comparison."""
 _MIN_BUDGET_NS = 100_000
 _MISSES = 3
-"""Waits in vain, one after the other, that end spinning at once."""
+"""After so many misses in a row spinning ends at once."""
 _ADVANTAGE = 0.97
 """Spinning must be this much faster to be chosen: it burns a core."""
 
 
 class SpinChooser:
-    """The chooser. ``measured`` is called once a step.
+    """Chooses between spinning and sleep. The lane calls ``measured`` once for each step.
 
     Attributes:
         budget_ns: How long each side may wait awake; 0 for not at all.
@@ -189,7 +189,7 @@ class SpinChooser:
         self._decide()
 
     def missed(self) -> None:
-        """A wait used its whole budget up: another process has the core. A few in a row end it."""
+        """Note a wait that used up its whole budget; ``_MISSES`` in a row end spinning."""
         self._misses = self._misses + 1 if self._missed_at - self._left <= 1 else 1
         self._missed_at = self._left
         if self._misses >= _MISSES and self._spinning:
@@ -227,16 +227,16 @@ _LOOK_EVERY = 64
 
 
 def own_cpus() -> list[int]:
-    """The cores that this process may use now: it may keep to fewer of them after its imports."""
+    """The cores that this process may use now; a program may restrict them after its imports."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
 
 
 class Cores:
-    """The cores of one environment's shards.
-    ``shards``: how many there are.
+    """Assigns cores to the shards of one environment.
+    ``shards``: the number of shards.
 
     Attributes:
-        awake: How many of them, the first ones, get a core that is not the client's.
+        awake: The number of shards, counted from the first, with a core that is not the client's.
     """
 
     def __init__(self, shards: int) -> None:
@@ -248,7 +248,7 @@ class Cores:
         self._getcpu = getattr(ctypes.CDLL(None), "sched_getcpu", None)
 
     def of_shards(self) -> list[int]:
-        """One more than each shard's core; 0 where it does not matter."""
+        """For each shard its core plus one, or 0 for any core."""
         self._until_look -= 1
         if self._until_look < 0:
             self._until_look = _LOOK_EVERY
@@ -260,7 +260,7 @@ class Cores:
 
 
 def place(shards: int, awake: int, client: int, cpus: list[int]) -> list[int]:
-    """One more than each shard's core, the awake ones first."""
+    """For each shard its core plus one; the first ``awake`` shards get cores of their own."""
     others = [cpu for cpu in cpus if cpu != client]
     sleepers = [client, *others]
     return [

@@ -37,25 +37,25 @@ from envhub_worker.protocol.messages.prefix import CHANGES, WATCHED_TYPES, Attri
 _CAUSE_S = 10.0
 _CAUSE_POLL_S = 0.01
 _UNSEEN_S = 5.0
-"""For how long a Ctrl-C waits for the jail that it came before."""
+"""How long a Ctrl-C during ``open_jail`` waits for the number of the jail, to end it."""
 
 
 Frames = list[Buffer]
 Unpack = Callable[[int, Frames], Any]
-"""Reads the frames that came from the runner at a place of the request."""
+"""Decodes a runner's frames; its first argument is the runner's index in the request."""
 
 
 class Request:
-    """Messages to all shards, encoded once for the lane, the history and a recovery.
+    """One message to each shard, encoded once for the lane, the crash history and a recovery.
 
     Args:
         operation: What the user called.
         messages: One for each shard.
-        frames: Those of each message.
+        frames: The frames of each message.
         bounds: The slices of the sub-environments, one for each shard.
-        plain: Whether no value in them had to be pickled.
+        plain: Whether no value in the messages had to be pickled.
 
-    ``sent``: the frames to send, if others than those to record.
+    ``sent``: the frames to send, where they differ from ``frames``, which are recorded.
     """
 
     __slots__ = ("_kept", "bounds", "frames", "messages", "operation", "plain", "sent")
@@ -77,7 +77,7 @@ class Request:
         self._kept: list[list[bytes]] | None = None
 
     def kept(self) -> list[list[bytes]]:
-        """The frames, copied: large values are sent from where they lie, and may change."""
+        """Copies of the frames; the frames of large values are views of memory that may change."""
         if self._kept is None:
             self._kept = [list(map(bytes, frames)) for frames in self.frames]
         return self._kept
@@ -87,16 +87,16 @@ class JailHandle:
     """An open jail. Not thread-safe: its owner holds a lock.
 
     Attributes:
-        number: The server's number for it.
-        runners: Its runners' numbers; sub-environments are spread over them in this order.
-        kept: Whether it goes on without a runner that has died.
-        report: One mapping per layer of the confinement: ``layer``, ``enforced``, ``detail``; of
-            a container around it too.
-        limits: Of its messages.
+        number: The number that the server gave the jail.
+        runners: The numbers of its runners, in the order of the shards.
+        kept: Whether the jail stays open when one of its runners dies.
+        report: One mapping for each layer of the confinement, with ``layer``, ``enforced`` and
+            ``detail``; layers of a container around the jail are in it, too.
+        limits: Bounds on its messages.
         attaching: Held from the deposit of descriptors for a runner until it has taken them.
-        before_end: Runs before it is ended; brings what it has printed last.
-        warnings: Those of its repository.
-        watched: The values that its runners watch.
+        before_end: Called before the jail is ended, to fetch its last output.
+        warnings: The warnings of its repository.
+        watched: The values of the attributes that its runners watch.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class JailHandle:
         self._asked: dict[int, int] = {}  # how many runners, by request
 
     def through(self, client: WorkerConnection) -> JailHandle:
-        """The same jail over another connection of ours."""
+        """A handle on the same jail over another connection."""
         jail = JailHandle(client, self.number, self.runners, self.report, self.limits)
         jail.before_end, jail.warnings, jail.watched = self.before_end, self.warnings, self.watched
         jail.attaching = self.attaching
@@ -140,26 +140,26 @@ class JailHandle:
         self.kept = True
 
     def expire(self, idle_s: float, deadline: Deadline) -> None:
-        """End the jail once it has been idle for so long."""
+        """Have the server end the jail once it has been idle for ``idle_s``."""
         message = m.ExpireIdle(self.number, max(1, int(idle_s * 1000)))
         expect_reply(self.client.request(message, deadline=deadline)[0], m.Done)
 
     def replace_runners(self, dead: Sequence[int], deadline: Deadline) -> list[int]:
-        """Fork a runner in the place of each that has died; returns the new numbers, in order."""
+        """Fork a new runner for each dead one; returns the new numbers, in order."""
         self.watched.forget()
         self.runners = [runner for runner in self.runners if runner not in dead]
         return self.start_runners(len(dead), deadline)
 
     def pack(self, message: m.Message) -> Frames:
         """The frames of a message to a runner."""
-        # the only way in for the caller's own objects; nothing is ever unpickled here
+        # The client pickles the caller's own objects here only, and never unpickles anything.
         return m.pack(message, pickler=framed, limits=self.limits)
 
     def request(
         self, operation: str, messages: Sequence[m.Message], bounds: list[tuple[int, int]]
     ) -> Request:
-        """A request of a message for each shard, ready to be sent.
-        Raises ``LocalProtocolError``: it cannot be sent.
+        """Encode one message for each shard; returns the request, ready to be sent.
+        Raises ``LocalProtocolError``: a message cannot be sent.
         """
         pickled = False
 
@@ -174,15 +174,15 @@ class JailHandle:
     def relay(
         self, operation: str, requests: Sequence[tuple[int, Frames]], *, deposited: bool = False
     ) -> int:
-        """Send a packed message to each of some runners, in one request; returns its id.
-        ``deposited``: as in ``Relay``.
+        """Send each of some runners a packed message, all in one request; returns its id.
+        ``deposited``: whether the runners get the deposited descriptors with it; see ``Relay``.
         """
         parts = tuple((runner, len(frames)) for runner, frames in requests)
         payload = [frame for _, frames in requests for frame in frames]
         return self.send_relay(m.Relay(self.number, operation, parts, deposited), payload)
 
     def send_relay(self, relay: m.Relay, payload: Sequence[Buffer]) -> int:
-        """Send frames to some runners; returns the request's id."""
+        """Send a ``Relay`` with the frames for its runners; returns the request's id."""
         request_id = self.client.send(relay, payload)
         self._asked[request_id] = len(relay.parts)
         return request_id
@@ -190,10 +190,10 @@ class JailHandle:
     def receive(
         self, request_id: int, deadline: Deadline, unpack: Unpack | None = None
     ) -> list[Any]:
-        """The runners' replies, in the order of the request, or what ``unpack`` makes of them.
-        Raises ``WorkerTimeoutError``: the deadline came first; ``WorkerDiedError``: the jail ended;
-        ``RunnersDiedError``: runners of a kept jail did; ``RemoteProtocolError``: a runner broke
-        the rules.
+        """The runners' replies, in the order of the request, decoded by ``unpack`` if given.
+        Raises ``WorkerTimeoutError``: the deadline came first; ``WorkerDiedError``: the jail
+        ended; ``RunnersDiedError``: runners of a kept jail died; ``RemoteProtocolError``: a runner
+        broke the protocol.
         """
         reply, payload = self.client.receive(request_id, deadline)
         count = self._asked.pop(request_id, None)
@@ -211,7 +211,7 @@ class JailHandle:
             return [unpack(index, part) for index, part in enumerate(parts)]
 
     def arrived(self, request_id: int) -> list[Frames]:
-        """The frames that have arrived from each runner and are not taken; none for an error."""
+        """Each runner's frames, if they have arrived, without removing them; empty for an error."""
         reply, payload = self.client.peek(request_id)
         if type(reply) is not m.RelayDone:
             return []
@@ -228,7 +228,7 @@ class JailHandle:
         self.client.forget(request_id)
 
     def _died(self, dead: Sequence[int], parts: list[Frames], unpack: Unpack) -> RunnersDiedError:
-        """The deaths that the server reports, which a runner cannot."""
+        """The error for deaths of runners, which only the server can report."""
         if not dead or not set(dead) <= set(range(len(parts))):
             raise RemoteProtocolError("the worker names dead runners that were not asked")
         messages = {index: self._unpack(index, parts[index]) for index in dead}
@@ -239,7 +239,7 @@ class JailHandle:
         return RunnersDiedError(living, deaths)
 
     def _unpack(self, _: int, frames: Sequence[Buffer]) -> m.Message:
-        if len(frames) > 1:  # with one frame there is nothing in front
+        if len(frames) > 1:  # a single frame has no prefixes (warnings, changed attributes)
             frames = self.warnings.take(self.watched.take(frames))
         return unpacked(frames, limits=self.limits)
 
@@ -251,7 +251,7 @@ class JailHandle:
         *,
         deposited: bool = False,
     ) -> list[m.Message]:
-        """``ask`` for messages that are not packed; a runner's exception is raised."""
+        """``ask`` with messages that are not packed; raises the first exception in the replies."""
         packed = [(runner, self.pack(message)) for runner, message in requests]
         replies = self.ask(operation, packed, deadline, deposited=deposited)
         for reply in replies:
@@ -266,7 +266,7 @@ class JailHandle:
         *,
         deposited: bool = False,
     ) -> list[m.Message]:
-        """``relay`` and ``receive``; of deaths, the first is raised."""
+        """Send packed messages to runners; returns the replies. Raises the first death."""
         try:
             return self.receive(self.relay(operation, requests, deposited=deposited), deadline)
         except RunnersDiedError as error:
@@ -274,13 +274,13 @@ class JailHandle:
 
     def output(self, operation: str, deadline: Deadline) -> str:
         """The last lines that the jail printed.
-        Raises ``WorkerDiedError``: the jail has ended, during ``operation``.
+        Raises ``WorkerDiedError``: the jail has ended during ``operation``.
         """
         reply, _ = self.client.request(m.ReadOutput(self.number, operation), deadline=deadline)
         return expect_reply(reply, m.Output).text
 
     def cause_of_death(self, operation: str) -> Exception:
-        """Why it has ended: the server knows, at the latest when it has reaped it."""
+        """Ask the server why the jail has ended, until it has reaped it; returns the error."""
         deadline = Deadline(_CAUSE_S)
         while not deadline.passed:
             try:
@@ -291,18 +291,18 @@ class JailHandle:
         return WorkerDiedError(f"the worker process died during {operation}", request=operation)
 
     def close(self, deadline: Deadline) -> None:
-        """End the jail and everything in it. A server that has gone has ended it already."""
+        """End the jail and everything in it; without effect if the server has ended."""
         self.ask_to_close()(deadline)
 
     def ask_to_close(self) -> Callable[[Deadline], None]:
-        """``close`` in two: returns what waits until nothing of it is left."""
+        """The first half of ``close``; returns the second, which waits for the jail's end."""
         self.before_end()
         request: int | None = None
         try:
             request = self.client.send(m.CloseJail(self.number))
         except WorkerError:
             pass
-        except BaseException:  # interruption.md, rule 7: the jail may not know of its end yet
+        except BaseException:  # interruption.md, rule 7: the request may not have left
             self._part(None, Deadline(0))
             raise
         return partial(self._part, request)
@@ -317,13 +317,13 @@ class JailHandle:
             self.drop()
 
     def drop(self) -> None:
-        """Close the connection; the jail has ended, or is about to. Idempotent."""
+        """Close the connection to a jail that has ended or is about to. Idempotent."""
         self.client.let_go(self.number)
         self.client.close()
 
 
 def _cut(payload: Frames, counts: Sequence[int]) -> list[Frames]:
-    """The frames of each part."""
+    """Cut the payload into parts of ``counts`` frames each. Trust: input from the worker."""
     if len(counts) == 1 and type(counts[0]) is int and counts[0] == len(payload) > 0:
         return [payload]
     if any(type(count) is not int or count < 1 for count in counts) or sum(counts) != len(payload):
@@ -333,13 +333,13 @@ def _cut(payload: Frames, counts: Sequence[int]) -> list[Frames]:
 
 
 def _nothing() -> None:
-    """Do nothing: the jail's output is not followed."""
+    """The default of ``before_end``, for a jail whose output is not followed."""
 
 
 def open_jail(
     client: WorkerConnection, request: m.OpenJail, limits: WireLimits, deadline: Deadline
 ) -> JailHandle:
-    """Open a jail. Raises ``SandboxUnavailableError``: a layer is missing; ``WorkerDiedError``."""
+    """Open a jail. Raises ``SandboxUnavailableError``: a layer cannot be enforced."""
     sent = client.send(request)
     try:
         reply, _ = client.receive(sent, deadline)
@@ -365,7 +365,7 @@ def _end_unseen(client: WorkerConnection, sent: int) -> None:
 
 
 def _runners(opened: m.JailOpened, count: int) -> list[int]:
-    """The numbers of as many runners as were asked for."""
+    """The numbers of the started runners, ``count`` different ones. Trust: the worker's reply."""
     runners = list(opened.runners)
     are_numbers = all(type(runner) is int for runner in runners)
     if not are_numbers or not len(set(runners)) == len(runners) == count:
@@ -374,40 +374,41 @@ def _runners(opened: m.JailOpened, count: int) -> list[int]:
 
 
 AttributeAnswer = tuple[Any, ...] | RemoteEnvError
-"""Values of an attribute, one for each sub-environment; or what is raised where none has it."""
+"""The attribute's value in each sub-environment, or the error that reading it raises."""
 
 
 class WatchedAttributes:
-    """The values of attributes that the runners watch: by the environment's number and their name.
+    """The values of watched attributes, by the environment's number and the attribute's name.
 
-    A reply names the attributes that have changed before it; the others have the values that are
-    kept here, and need no request. Trust: the values come from the worker, as those of a ``call``
-    do. They are of immutable types, so a caller cannot change what is kept.
+    Each reply names the attributes that have changed since the last reply. All others still have
+    the values that are kept here, so reading them needs no request. Trust: the values come from
+    the worker, like the result of a ``call``. They have immutable types, so a caller cannot change
+    a kept value.
     """
 
     def __init__(self) -> None:
         self._values: dict[Attribute, AttributeAnswer] = {}
 
     def note(self, number: int, name: str, values: AttributeAnswer) -> bool:
-        """Keep values that were read. Returns whether they can be kept."""
+        """Keep values that were read. Returns whether their types allow that."""
         if type(values) is tuple and any(type(value) not in WATCHED_TYPES for value in values):
             return False
         self._values[number, name] = values
         return True
 
     def values(self, number: int, name: str) -> AttributeAnswer | None:
-        """One for each sub-environment, or what is raised; None if that is not known."""
+        """The kept values, one for each sub-environment, or the kept error; None if unknown."""
         return self._values.get((number, name))
 
     def forget(self) -> None:
-        """Drop all: a runner was replaced, or a reply was lost."""
+        """Drop all values: a runner was replaced, or a reply was lost."""
         self._values.clear()
 
     def take(self, frames: Sequence[Buffer]) -> Sequence[Buffer]:
-        """A reply's own frames, without the changes in front. Trust: input from the worker.
-        Raises ``RemoteProtocolError``: these are not what was agreed on.
+        """Drop the attributes that a reply says have changed; returns the reply's other frames.
+        Trust: input from the worker. Raises ``RemoteProtocolError``: the prefix is malformed.
         """
-        if len(frames) >= DEFAULT_LIMITS.frames:  # there was no room in front
+        if len(frames) >= DEFAULT_LIMITS.frames:  # the reply had no room for a frame of changes
             self.forget()
         changed, rest = CHANGES.read(frames)
         for attribute in changed:

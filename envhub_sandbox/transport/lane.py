@@ -1,9 +1,10 @@
-"""The way of an environment's requests to its runners: over the server, or a faster one.
+"""Lanes: the ways of an environment's requests to its runners, over the server or faster.
 
-There are three: ``Lane``, below; ``ServedLane``, which is the same with faster steps; and
-``SharedMemoryLane``, whose steps and small messages need no server. What these two have in common
-is in ``shared_memory/slab_lane``. Which of them an environment has is decided once, when it is
-built (``session/builder``). What a request means does not depend on the lane.
+There are three. ``Lane``, below, sends each request to the server, which passes it on.
+``ServedLane`` does the same with faster steps. ``SharedMemoryLane`` needs no server for steps and
+small messages. The common part of the latter two is in ``shared_memory/slab_lane``.
+``session/builder`` chooses the lane once, when it builds the environment. The meaning of a request
+does not depend on the lane.
 """
 
 from __future__ import annotations
@@ -23,35 +24,36 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.spaces import batches
 
 RECHECK_MS = 2
-"""After how long to look once more where a doorbell may have crossed with our going to sleep."""
+"""When to look again after going to sleep: a runner may have answered just before, unnoticed."""
 LOOK_MS = 500
-"""One wait for the first of several lanes: those over a network have to be asked in between whether
-they are still there."""
+"""The longest wait for the first of several lanes, so that a lost connection over a network is
+noticed in between."""
 
 
 class Lane:
-    """The way to the runners of one environment: one request at a time, and its answers; or
-    several steps one after the other, where it ``takes_more``.
+    """Sends the requests of one environment to its runners over ZeroMQ and the server, one request
+    at a time; several steps one after the other, where it ``takes_more``. Other lanes derive from
+    it to make steps faster.
 
-    The order is the point. ``send_step`` or ``send`` comes first, then ``wait`` or ``replies``, for
-    which a deadline is given that also bounds whatever else has to be fetched. Where that wait ends
-    in any other way than with answers, the lane still knows what it is owed, and ``catch_up`` must
-    take it before anything else is sent: a step's answer would otherwise be taken for the next's.
-    ``result`` waits for nothing, so that what it raises is never a signal handler's.
+    The order of calls matters:
 
-    This one goes over ZeroMQ and the server, which passes frames on to the runners; those that are
-    derived of it have faster steps.
+    1. ``send_step`` or ``send``.
+    2. ``wait`` or ``replies``. Their deadline also bounds further fetches, as of large infos.
+       If this wait ends without all answers, the lane remembers which answers are owed.
+       ``catch_up`` must then take them before the next request is sent, which would otherwise get
+       the answers to this one.
+    3. ``result``. It never waits, so an exception from it is never a signal handler's.
 
     Args:
-        jail: Where the runners are.
-        runners: One for each shard.
-        number: What the environment is called there.
-        declared: What its answers are held against.
+        jail: The jail of the runners.
+        runners: The number of each shard's runner.
+        number: The environment's number in the jail.
+        declared: Checks the answers against the manifest and joins them.
 
     Attributes:
-        name: What a crash bundle calls it.
+        name: The lane's name in a crash bundle.
         jail, runners, number, declared: As given.
-        elapsed_ns: What the last step took, from its sending to the last answer.
+        elapsed_ns: The time of the last step, from its sending to the last answer.
     """
 
     name = "frames"
@@ -66,22 +68,22 @@ class Lane:
         self.declared = declared
         self._asked_ns = 0
         self._answers: list[m.Message] = []
-        self._owed: deque[tuple[int, int, Unpack | None]] = deque()  # requests, and since when
+        self._owed: deque[tuple[int, int, Unpack | None]] = deque()  # id, send time, decoder
         self._sending = False
 
     @property
     def takes_more(self) -> bool:
-        """Whether a step can be sent while earlier ones are owed; answers come in that order.
+        """Whether a step can be sent while answers to earlier steps, in order, are still owed.
 
-        What a fresh runner may have to repeat is the last request alone.
+        Not in a kept jail: a runner that replaces a dead one repeats only the last request.
         """
         return len(self.runners) == 1 and not self.jail.kept
 
     def expect_more(self) -> None:
-        """A step waits for the answer to the last. If the lane can, it ``takes_more`` next time."""
+        """Note that a step waits for the last answer, so that the lane ``takes_more`` later."""
 
     def send_step(self, actions: Any, *, ahead: bool = False) -> None:
-        """Send a validated batch of actions: to each shard its slice.
+        """Send a validated batch of actions, to each shard its slice.
 
         Args:
             actions: The batch.
@@ -99,12 +101,12 @@ class Lane:
         self._send_to_all("step", packed, ahead=ahead)
 
     def wait(self, deadline: Deadline) -> None:
-        """Until every shard has answered the step, with all that belongs to it.
+        """Wait until every shard has answered the step, including its infos.
 
         Raises:
             WorkerTimeoutError: The deadline came first.
             WorkerDiedError: The jail has ended.
-            RunnersDiedError: Runners of a kept jail did; it has what the others answered.
+            RunnersDiedError: Runners of a kept jail died; it has the others' answers.
             RemoteProtocolError: A runner broke the rules.
         """
         asked_ns = self._owed[0][1]
@@ -112,21 +114,21 @@ class Lane:
         self.elapsed_ns = perf_counter_ns() - asked_ns
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-        """What ``VectorEnv.step`` returns; with these infos, if there are other ones.
+        """The tuple that ``VectorEnv.step`` returns, with ``infos`` in it if given.
 
         Trust: input from the worker.
 
         Raises:
-            Misfit: The shards' infos do not go together; ``send_for_infos`` asks for others.
+            Misfit: The shards' infos cannot be joined; ``send_for_infos`` asks for other ones.
             RemoteEnvError: The repository's code raised.
             RemoteProtocolError: A runner broke the rules.
         """
-        # not kept: a large batch that its owner has dropped is memory for the next
+        # not kept, so that the next batch can use the memory of one that the caller has dropped
         answers, self._answers = self._answers, []
         try:
             return self.declared.step(all_replies(answers, m.StepDone), infos)
         except batches.Misfit:
-            self._answers = answers  # to be joined once more, with other infos
+            self._answers = answers  # for the next call, which brings other infos
             raise
 
     def send(self, request: Request) -> None:
@@ -151,15 +153,15 @@ class Lane:
         *,
         ahead: bool = False,
     ) -> None:
-        """Send some runners a message each; ``replies`` has what they answer."""
+        """Send each of some runners a packed message; ``replies`` returns their answers."""
         parts = list(zip(runners, packed, strict=True))
         self._send(lambda: self.jail.relay(operation, parts), ahead=ahead)
 
     def _send(
         self, relay: Callable[[], int], unpack: Unpack | None = None, *, ahead: bool = False
     ) -> None:
-        """Send by ``relay``; ``unpack`` makes messages of the answers, where these are none."""
-        while self._owed and not ahead:  # such as infos, of a step that another has raised in
+        """Send by ``relay``; ``unpack`` decodes answers that are not messages."""
+        while self._owed and not ahead:  # such as infos that are no longer needed: a shard raised
             self.jail.forget(self._owed.popleft()[0])
         self._sending = True  # interruption.md, rule 1: half a message, or a whole one
         try:
@@ -172,9 +174,9 @@ class Lane:
         self._sending = False
 
     def send_for_infos(self, *, failed: bool = False) -> None:
-        """Ask for the last infos as each sub-environment gave them; ``replies`` has them.
+        """Ask for the last infos as each sub-environment returned them; ``replies`` has them.
 
-        Or say that the step has ``failed``, since those cannot be joined.
+        With ``failed``, tell the runners that the step failed, since its infos cannot be joined.
 
         Raises:
             EnvHubError: Nothing was sent.
@@ -183,64 +185,65 @@ class Lane:
         self.send_some("step", self.runners, packed)
 
     def replies(self, deadline: Deadline) -> list[Any]:
-        """Every shard's reply to what was sent; raises as ``wait`` does."""
+        """Every shard's reply to the request; raises as ``wait`` does."""
         try:
             sent, _, unpack = self._owed[0]
             received = self.jail.receive(sent, deadline, unpack)
-        except RunnersDiedError:  # that was the answer
+        except RunnersDiedError:  # this is an answer, so it is owed no more
             self._owed.popleft()
             raise
         self._owed.popleft()
         return received
 
     def answered(self) -> bool:
-        """Whether ``wait``, or ``replies``, has nothing to wait for: it returns, or raises.
+        """Whether ``wait`` or ``replies`` would return or raise at once.
 
-        Never waits itself, and takes nothing away. Where it says no, it is asked again once one of
-        its ``sources`` is readable, and at least twice a second; an end may be seen only then.
+        Never waits, and removes no answer. After False, call it again when one of the lane's
+        ``sources`` is readable, and at least twice a second, to notice an end.
         """
         return not self._owed or self.jail.client.arrived(self._owed[0][0])
 
     def sources(self) -> list[Source]:
-        """What becomes readable, at the latest ``RECHECK_MS`` late, when ``answered`` may say yes.
+        """The descriptors and sockets that become readable when ``answered`` may return True.
 
-        For as long as what was sent is owed.
+        They may be up to ``RECHECK_MS`` late. Valid while an answer is owed.
         """
         return self.jail.client.sources()
 
     def catch_up(self, deadline: Deadline) -> None:
-        """Take what is owed and drop it; raises as ``wait`` does.
+        """Take the answers that are owed and drop them; raises as ``wait`` does.
 
         Raises:
-            WorkerError: The sending was interrupted: what was sent is not known.
+            WorkerError: An interrupt came while the request was sent or its answer read, so the
+                lane does not know what is owed.
         """
         if self._sending or self.jail.client.torn:
             raise WorkerError("the request was interrupted while it was sent, or its answer taken")
-        while self._owed:  # by the server: a derived lane is owed other answers as well
+        while self._owed:  # the server's answers; a derived lane takes those in slabs itself
             Lane.replies(self, deadline)
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
-        """Go to other runners in the place of those that have died.
+        """Replace the runners that have died.
 
         Args:
-            dead: Their shards.
-            fresh: The runner of each, in which the environment is built already.
-            deadline: For all of it.
+            dead: The shards whose runners died.
+            fresh: The new runner of each, which has built its sub-environments already.
+            deadline: Bounds the whole call.
         """
         for index, runner in zip(dead, fresh, strict=True):
             self.runners[index] = runner
 
     def of_shard(self, shard: int) -> Lane:
-        """A way to one shard alone, by messages: before each of them ``leave_slots`` is called."""
+        """A lane of messages to one shard alone; call ``leave_slots`` before each message."""
         results = Results(self.declared.manifest, [self.declared.bounds[shard]])
         results.apart, results.max_bytes = self.declared.apart, self.declared.max_bytes
         return Lane(self.jail, [self.runners[shard]], self.number, results)
 
     def leave_slots(self) -> None:
-        """Results come another way next: no shard may write where a batch is held."""
+        """Have the shards write into no slot that a caller may hold; for results by messages."""
 
     def owe_for(self, other: Lane) -> None:
-        """Have ``catch_up`` take what another lane of this jail is owed."""
+        """Add the answers that another lane of this jail is owed, for ``catch_up`` to take."""
         self._owed.extend(other._owed)
         self._sending = self._sending or other._sending
 
@@ -250,14 +253,14 @@ class Lane:
         return client.stale_replies, client.sent_bytes, client.received_bytes
 
     def close(self) -> None:
-        """Give back what is its own; the jail is not."""
+        """Release the lane's own resources, which do not include the jail."""
 
 
 def answered_first(lanes: Sequence[Lane], deadline: Deadline) -> list[int]:
-    """The places of those that have answered, or ended; none where the deadline came first.
+    """The indices of the lanes that have answered or ended; empty if the deadline came first.
 
-    Sleeps until there is one. A lane that always claims to have answered, or rings without end,
-    keeps no other from being found.
+    Sleeps until there is such a lane. A hostile lane that always claims to have answered, or
+    rings without end, does not hide others: all lanes are looked at, at least twice a second.
     """
     import zmq
 
@@ -268,19 +271,19 @@ def answered_first(lanes: Sequence[Lane], deadline: Deadline) -> list[int]:
     poller, places = zmq.Poller(), _listen(lanes)
     for source in places:
         poller.register(source, zmq.POLLIN)
-    look = Deadline(RECHECK_MS / 1000)  # an answer may have crossed with our beginning to listen
+    look = Deadline(RECHECK_MS / 1000)  # an answer may have come just before we listened
     while not answered and not deadline.passed:
         left_ms, look_ms = deadline.left_ms(), look.left_ms() or 0
         rung = poller.poll(look_ms if left_ms is None else min(look_ms, left_ms))
         some: Iterable[int] = sorted({index for source, _ in rung for index in places[source]})
-        if look.passed:  # also where one rings without end
+        if look.passed:  # reached even if a lane rings without end
             some, look = everywhere, Deadline(LOOK_MS / 1000)
         answered = _answered(lanes, some)
     return answered
 
 
 def _listen(lanes: Sequence[Lane]) -> dict[Source, list[int]]:
-    """What is to be polled, and for which lanes: those in one server share some of it."""
+    """The sources to poll, each with the indices of its lanes; lanes in one server share some."""
     places: dict[Source, list[int]] = {}
     for index, lane in enumerate(lanes):
         for source in lane.sources():

@@ -1,8 +1,8 @@
-"""What a jail prints, brought to a log or a file while it runs.
+"""Copies a jail's output to a log, a file or stderr while the jail runs.
 
-A thread asks the server a few times a second, over a connection of its own: the steps do not
-notice. Only where it is asked for: ``Policy(output=...)``, or DEBUG on
-``envhub_sandbox.worker.output``. Trust: the text is the jail's; it loses its control characters.
+A thread asks the server for it a few times a second, over a connection of its own, so that steps
+are not delayed. It runs only with ``Policy(output=...)``, or with DEBUG on the logger
+``envhub_sandbox.worker.output``. Trust: the text is the jail's; control characters are removed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.transport.connection import WorkerConnection
 
 FILE_BYTES = 64 << 20
-"""What one file takes; a worker may print for ever."""
+"""The most that is written to one file, since a worker may print for ever."""
 _PERIOD_S = 0.25
 _ASK_S = 5.0
 _LINE_CHARS = 4096
@@ -39,14 +39,14 @@ Sink = Callable[[str], object]
 
 
 class Lines:
-    """Cuts bytes into lines that a terminal only prints."""
+    """Cuts bytes into lines without control characters, and gives each line to the sinks."""
 
     def __init__(self, sinks: Sequence[Sink]) -> None:
         self._sinks = sinks
         self._rest = b""
 
     def feed(self, data: bytes) -> None:
-        """Take bytes; every line that they end goes to the sinks."""
+        """Take bytes; every complete line goes to the sinks."""
         *lines, self._rest = re.split(_ENDS, self._rest + data)
         for line in lines:
             self._emit(line)
@@ -55,13 +55,13 @@ class Lines:
             self._rest = self._rest[_LINE_BYTES:]
 
     def say(self, text: str) -> None:
-        """A line of our own, after what came before it."""
+        """Emit a line of our own, after the pending text."""
         self.end()
         for sink in self._sinks:
             sink(f"[{text}]")
 
     def end(self) -> None:
-        """There is no more: the last line need not be ended."""
+        """Emit the last line, which may lack its newline."""
         if self._rest:
             self._emit(self._rest)
             self._rest = b""
@@ -73,7 +73,7 @@ class Lines:
 
 
 def bounded_sink(write: Sink, left: int) -> Sink:
-    """What writes each line, until ``left`` bytes are written; then it says once that it stops."""
+    """A sink that writes lines until ``left`` bytes are used up, then a note that it stops."""
 
     def sink(line: str) -> None:
         nonlocal left
@@ -85,12 +85,12 @@ def bounded_sink(write: Sink, left: int) -> Sink:
 
 
 class OutputSinks:
-    """Where a jail's lines go: a log, a file, stderr, several of these or nowhere.
+    """The destinations of a jail's lines: a log, a file, stderr, several of these, or none.
 
     Args:
-        label: What the log calls the jail.
-        path: The file, or None; it gets ``FILE_BYTES``, with what is in it.
-        stderr: Whether this program's stderr gets them, ``FILE_BYTES`` of them.
+        label: The jail's name in the log.
+        path: The file, or None; it grows to at most ``FILE_BYTES``.
+        stderr: Whether lines also go to this program's stderr, at most ``FILE_BYTES``.
     Raises ``PolicyError``: the file cannot be written.
     """
 
@@ -118,7 +118,7 @@ class OutputFollower:
     Args:
         connect: Makes a connection to the server, for this thread alone.
         jail: The jail's number.
-        sinks: Where its lines go.
+        sinks: The destinations of its lines.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class OutputFollower:
         self._thread.start()
 
     def stop(self) -> None:
-        """Bring the rest, and end. To be called before the jail is closed. Idempotent."""
+        """Fetch the rest of the output and stop. Call it before closing the jail. Idempotent."""
         self._stopped.set()
         if self._thread is not threading.current_thread():
             self._thread.join(_ASK_S)
@@ -142,7 +142,7 @@ class OutputFollower:
             client = self._connect()
             try:
                 while not self._stopped.wait(_PERIOD_S):
-                    with contextlib.suppress(WorkerTimeoutError):  # a busy one is asked again
+                    with contextlib.suppress(WorkerTimeoutError):  # a busy server is asked again
                         self._ask(client)
                 rest = Deadline(_ASK_S)  # as long as stop() waits: a server may never end
                 while self._ask(client) and not rest.passed:
@@ -156,7 +156,7 @@ class OutputFollower:
             self._sinks.close()
 
     def _ask(self, client: WorkerConnection) -> int:
-        """Bring what there is; returns how many bytes that was."""
+        """Fetch new output; returns how many bytes it had."""
         request = m.FollowOutput(self._jail, self._offset)
         reply = expect_reply(client.request(request, deadline=Deadline(_ASK_S))[0], m.OutputBytes)
         if reply.start > self._offset:
@@ -167,7 +167,7 @@ class OutputFollower:
 
 
 def _write_to_stderr(text: str) -> None:
-    """To today's stderr, which may be a notebook's; one that takes nothing is no error."""
+    """Write to the current ``sys.stderr``, such as a notebook's; failing to write is no error."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         sys.stderr.write(text)
         sys.stderr.flush()

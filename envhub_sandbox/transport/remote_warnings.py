@@ -1,7 +1,8 @@
-"""The warnings of a repository, which become warnings of Python's in the client, once each.
+"""Shows each warning of a repository once, as a Python warning in the client.
 
-They are collected where a reply comes in, on any thread, and shown at the end of the caller's
-request: a filter of the caller's may make an error of one, and that must not count as the worker's.
+Any thread collects warnings when it reads a reply. They are shown at the end of the caller's
+request, because a filter of the caller may turn a warning into an error, which must not count as an
+error of the worker.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from envhub_worker.protocol.messages.prefix import (
 from envhub_worker.protocol.text import printable
 
 MOST = 100
-"""Different warnings of one repository that are shown."""
+"""The most different warnings that are shown of one repository."""
 _PACKAGE = __name__.partition(".")[0]
 _SHARED = (
     "sub-environments that share a process use {} of it, so they may give other results than with "
@@ -43,8 +44,8 @@ class RemoteWarnings:
     """The warnings of one repository, from any of its processes.
 
     Attributes:
-        unshown: Those that the caller has not seen yet. Always the same object.
-        note_shared: Called where sub-environments that share a process are not independent.
+        unshown: The warnings that the caller has not seen yet. Always the same object.
+        note_shared: Called when sub-environments that share a process are not independent.
     """
 
     def __init__(self) -> None:
@@ -53,8 +54,8 @@ class RemoteWarnings:
         self._known: set[RemoteWarning] = set()
 
     def take(self, frames: Sequence[Buffer]) -> Sequence[Buffer]:
-        """A reply's own frames, without the warnings in front. Trust: input from the worker.
-        Raises ``RemoteProtocolError``: these are not what was agreed on.
+        """Collect the warnings in front of a reply; returns the reply's other frames.
+        Trust: input from the worker. Raises ``RemoteProtocolError``: the prefix is malformed.
         """
         warnings, rest = WARNINGS.read(frames)
         for warning in warnings:
@@ -62,7 +63,7 @@ class RemoteWarnings:
                 self._collect(warning)
             elif self.note_shared is not None:
                 self.note_shared()
-                self.note_shared = None  # a hostile worker says it again and again
+                self.note_shared = None  # only once: a hostile worker may repeat it
                 self._collect(("SharedStateWarning", _SHARED.format(SHARED_STATE[warning[1]])))
         return rest
 
@@ -74,8 +75,8 @@ class RemoteWarnings:
         self.unshown.append(warning if len(shown) <= MOST else _NO_MORE)
 
     def show(self, label: str) -> None:
-        """Show new warnings, at the line of the caller's own code.
-        Raises ``RemoteEnvWarning``: a filter of the caller's wants it; the rest is shown later.
+        """Show new warnings at the line of the caller's own code.
+        Raises ``RemoteEnvWarning``: a filter of the caller asks for it; the rest is shown later.
         """
         while self.unshown:
             try:

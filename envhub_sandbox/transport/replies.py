@@ -1,7 +1,7 @@
-"""What a reply says: the message that was asked for, or the error that it means; or that none came.
+"""Turns replies into the expected message or into an exception.
 
-Everything that a server or a runner can say becomes an exception here, and nowhere else: out of
-fixed tables, with texts that are cut and made printable.
+Only this module makes exceptions from what a server or a runner says: their classes come from fixed
+tables, and their texts are cut and made printable.
 """
 
 from __future__ import annotations
@@ -32,23 +32,22 @@ from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.text import continued, printable, quoted
 
 _WORD_CHARS = 100
-"""Of an operation, a signal, or a reason."""
+"""The most characters of an operation, a signal, or a reason."""
 _PROFILE = 'profile "(strict|no-userns|container)"'
 
 
 class UnreachableError(SandboxUnavailableError):
-    """There is no server, or it is just ending: it has said nothing."""
+    """There is no server, or it ended before it answered."""
 
 
 class RunnersDiedError(WorkerDiedError):
-    """Runners of a kept jail have died; the others have answered.
+    """Runners of a kept jail have died; the other runners have answered.
 
-    Never seen by a user, who gets ``first``, or nothing.
+    Users never see it: a recovery handles it, or ``first`` is raised instead.
 
     Attributes:
-        replies: In the order of the request, or what was made of them; None where a runner has
-            died.
-        deaths: How, by its place in the request.
+        replies: The replies, decoded, in the order of the request; None for a dead runner.
+        deaths: Each dead runner's error, by the runner's index in the request.
         jail_gone: Whether the jail has ended, too.
     """
 
@@ -66,9 +65,9 @@ class RunnersDiedError(WorkerDiedError):
 
 
 def expect_reply(reply: m.Message, kind: type[m.M]) -> m.M:
-    """The reply, which must be of this kind.
-    Raises ``RemoteProtocolError``: it is another message; or the error that a refusal or a death
-    means.
+    """Return the reply if it is of this kind.
+    Raises ``RemoteProtocolError``: it is another message; the error for a refusal or a death, if
+    it is one of these.
     """
     if isinstance(reply, m.Refusal) and kind is not m.Refusal:
         raise refusal(reply)
@@ -78,7 +77,7 @@ def expect_reply(reply: m.Message, kind: type[m.M]) -> m.M:
 
 
 def check_reply(reply: m.Message) -> None:
-    """Raise what the repository raised, by a runner's reply.
+    """Raise the repository's exception, if a runner's reply has one.
     Raises ``RemoteProtocolError``: the runner sent a message of the server's.
     """
     if isinstance(reply, m.RaisedException):
@@ -88,7 +87,7 @@ def check_reply(reply: m.Message) -> None:
 
 
 def typed_reply(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.M:
-    """The reply, which must be of this kind, or of one of these. Raises ``RemoteProtocolError``."""
+    """Return the reply if it is of this kind, or of one of several. Raises if it is not."""
     if isinstance(reply, kind):
         return reply
     kinds = kind if isinstance(kind, tuple) else (kind,)
@@ -102,7 +101,7 @@ def typed_reply(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.
 
 
 def _named(fix: str) -> str:
-    """What to do, with a profile written as an option of the place that the user is at."""
+    """The advice, with a profile written as the user sets it: as an argument or a CLI option."""
     return re.sub(_PROFILE, lambda match: option_name("profile", match[1]), fix)
 
 
@@ -177,7 +176,7 @@ _LOADING = {
     "return": "its make_env returned something unusable",
 }
 _LOADERS_OWN = (".EntryError", ".ArgumentsError")
-"""What our own loader raises; its traceback is of no use."""
+"""Exceptions of our own loader, whose tracebacks say nothing about the repository."""
 
 
 def raised(reply: m.RaisedException) -> EnvHubError:
@@ -200,7 +199,7 @@ def raised(reply: m.RaisedException) -> EnvHubError:
 
 
 def _harmless(reply: m.RaisedException) -> m.RaisedException:
-    """The same without what a terminal would obey, and bounded."""
+    """The same message with bounded texts that a terminal can print safely."""
     return m.RaisedException(
         reply.builtin,
         one_line(reply.type_name, 512),

@@ -1,4 +1,4 @@
-"""Checks what the shards sent against what was declared, and joins it into one batch."""
+"""Checks the shards' replies against the manifest, and joins them into one batch."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _SHOWN = 500
 StepResult = tuple[Any, Any, Any, Any, dict[Any, Any]]
 OwnInfo = tuple[int, dict[Any, Any], batches.Forms]
 Own = tuple[list[list[dict[Any, Any]]], Sequence[bool], tuple[Any, ...]]
-"""See ``Results.own``."""
+"""Infos of each sub-environment, which members are Python numbers, and an odd reward, if any."""
 
 
 class Results:
     """Joins the replies for one environment. Trust: input from the worker.
-    ``manifest``: what the worker declared.
+    ``manifest``: the description of the environment that the worker declared.
     ``bounds``: the slices of the sub-environments, in the order of the replies.
 
     Attributes:
         manifest, bounds: As given.
-        count: The number of sub-environments: all, or those of one worker of a fleet.
-        slices: The same as ``bounds``, counted from the first of these.
-        apart: Whether infos come as each sub-environment gave them, under its index; infos of an
-            episode that began in the same step, under the index plus ``count``.
-        looks_inside: Whether the values of observations are checked or changed here, and not only
+        count: The number of sub-environments: all, or those of one worker of several.
+        slices: The same as ``bounds``, counted from the first of these sub-environments.
+        apart: Whether infos come apart, as each sub-environment returned them: under its index,
+            and for an episode that began in the same step, under its index plus ``count``.
+        looks_inside: Whether the values of observations are checked or changed, and not only
             their classes, dtypes and shapes.
         max_bytes: How much larger than their messages the workers' infos may be when joined.
     """
@@ -55,8 +55,8 @@ class Results:
         self.looks_inside = self._declared or self._restores
 
     def step(self, replies: list[m.StepDone], infos: dict[Any, Any] | None = None) -> StepResult:
-        """What ``VectorEnv.step`` returns, with these infos instead of the replies', if given.
-        Raises ``Misfit``: the shards' infos do not fit together; ``joined_own`` makes others.
+        """The tuple that ``VectorEnv.step`` returns, with ``infos`` in it if given.
+        Raises ``Misfit``: the shards' infos cannot be joined; ``joined_own`` can join others.
         """
         return (
             self._observation([reply.observation for reply in replies]),
@@ -69,7 +69,7 @@ class Results:
     def joined_steps(
         self, parts: Sequence[StepResult], infos: dict[Any, Any] | None = None
     ) -> StepResult:
-        """Join the results of workers, each of which was checked; as ``step``."""
+        """Join several workers' checked results of a step; returns and raises as ``step``."""
         observations, rewards, terminations, truncations, own = zip(*parts, strict=True)
         if len({part.shape[1:] for part in rewards}) > 1:
             raise RemoteProtocolError("the workers sent rewards of different shapes")
@@ -84,7 +84,7 @@ class Results:
     def joined_resets(
         self, parts: Sequence[tuple[Any, dict[Any, Any]]], infos: dict[Any, Any] | None = None
     ) -> tuple[Any, dict[Any, Any]]:
-        """Join the workers' results of a reset."""
+        """Join several workers' results of a reset."""
         observations, own = zip(*parts, strict=True)
         joined = self._joined_infos(own) if infos is None else infos
         return batches.join(self._space, observations), joined
@@ -99,14 +99,14 @@ class Results:
     def reset(
         self, replies: list[m.ResetDone], infos: dict[Any, Any] | None = None
     ) -> tuple[Any, dict[Any, Any]]:
-        """What ``VectorEnv.reset`` returns; as ``step``."""
+        """The tuple that ``VectorEnv.reset`` returns; ``infos`` as for ``step``."""
         observation = self._observation([reply.observation for reply in replies])
         if infos is None:
             infos = self.infos([reply.info for reply in replies])
         return observation, infos
 
     def joined_own(self, replies: list[m.Value]) -> dict[Any, Any]:
-        """Join the sub-environments' own infos as Gymnasium does.
+        """Join the infos of all sub-environments, which came singly, as Gymnasium does.
         Raises ``RemoteEnvError``: Gymnasium would raise, too.
         """
         own = self.own_pairs(replies)
@@ -127,8 +127,9 @@ class Results:
         return self._restored(infos)
 
     def own_pairs(self, replies: list[m.Value]) -> list[OwnInfo]:
-        """Those infos, each with its sub-environment's index and its forms.
-        Raises ``RemoteProtocolError``: they are of others, or none. Trust: input from the worker.
+        """The infos of all sub-environments, each with its index and its forms.
+        Trust: input from the worker. Raises ``RemoteProtocolError``: the infos are malformed, or
+        the index of one is out of range.
         """
         pairs: list[OwnInfo] = []
         start = 0
@@ -139,7 +140,7 @@ class Results:
         return pairs
 
     def infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
-        """One mapping of the shards' infos."""
+        """Join the shards' infos into one mapping."""
         if len(parts) == 1:
             return self._restored(parts[0])
         if self.apart:
@@ -147,7 +148,7 @@ class Results:
         return self._restored(batches.join_infos(parts, self._sizes))
 
     def _beside(self, parts: Sequence[dict[Any, Any]]) -> dict[Any, Any]:
-        """Infos that came apart, of all shards. Trust: input from the worker."""
+        """Join the shards' infos that came apart. Trust: input from the worker."""
         own: dict[Any, Any] = {}
         marks: list[dict[Any, Any]] = []
         for part, (start, _), size in zip(parts, self.slices, self._sizes, strict=True):
@@ -163,15 +164,15 @@ class Results:
             raise RemoteProtocolError(_NOT_ONE_EACH) from error
 
     def joined(self, infos: dict[Any, Any]) -> dict[Any, Any]:
-        """Infos as ``VectorEnv`` has them, also where they came apart; raises as ``own``."""
+        """Infos as ``VectorEnv`` returns them, also if they came apart; raises as ``each``."""
         if not self.apart:
             return infos
         pairs = [(at, pair) for at, some in enumerate(self.each(infos)) for pair in some]
         return self._joined_pairs(pairs)
 
     def each(self, infos: dict[Any, Any]) -> list[list[dict[Any, Any]]]:
-        """Infos that came apart: each sub-environment's, in their order.
-        Raises ``RemoteEnvError``: a reward is no number.
+        """Each sub-environment's infos, in order, from infos that came apart.
+        Raises ``RemoteEnvError``: a reward is not a number.
         """
         with UNTRUSTED:
             own, _, reward = self.own(infos)
@@ -181,8 +182,9 @@ class Results:
         return own
 
     def own(self, infos: dict[Any, Any]) -> Own:
-        """Infos that came apart; for a single sub-environment also which members of its observation
-        are numbers of Python, and a reward that is no number. Trust: input from the worker.
+        """Each sub-environment's infos, from infos that came apart. A single sub-environment also
+        has marks of which members of its observation are Python numbers, and a reward that is not
+        a number. Trust: input from the worker.
         """
         places = sorted(key for key in infos if type(key) is int and key >= 0)
         scalars, reward = infos.get(batches.APART_SCALARS, ()), infos.get(batches.APART_REWARD, ())
@@ -195,7 +197,7 @@ class Results:
             own[index % self.count].append(infos[index])
         if type(scalars) is not tuple:
             raise RemoteProtocolError(_NOT_ONE_EACH)
-        for key in infos:  # marks of ours: which were lost and came back
+        for key in infos:  # our masks of the sub-environments that were lost and came back
             if f"_{key}" in infos:
                 for at in np.flatnonzero(infos[f"_{key}"]):
                     own[at] = [*own[at][:-1], {**(own[at] or [{}])[-1], key: True}]
@@ -203,14 +205,14 @@ class Results:
 
     def _restored(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         final = infos.get("final_obs") if self._restores else None
-        # a repository with its own vector environment may return any final_obs: leave those alone
+        # a repository with its own vector environment may return any final_obs: leave others alone
         if type(final) is np.ndarray and final.dtype == object and final.ndim == 1:
             for index, member in enumerate(final):
                 final[index] = batches.restore(self._space, member)
         return infos
 
     def info(self, reply: m.Message | None) -> dict[Any, Any]:
-        """A shard's infos from its reply; empty for None. Raises ``RemoteEnvError``: it raised."""
+        """A shard's infos from its reply; empty for None. Raises if the reply has an exception."""
         if reply is None:
             return {}
         [answer] = all_replies([reply], m.Value)
@@ -219,7 +221,7 @@ class Results:
         return answer.value
 
     def one_each(self, operation: str, replies: Sequence[m.Value | m.WatchDone]) -> tuple[Any, ...]:
-        """One value for each sub-environment."""
+        """Join the replies' tuples into one value for each sub-environment."""
         gathered: list[Any] = []
         for reply, size in zip(replies, self._sizes, strict=True):
             if type(reply.value) is not tuple or len(reply.value) != size:
@@ -249,15 +251,15 @@ class Results:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _is_own(self, name: str, part: Any) -> bool:
-        """Whether our own vector environments return such arrays, which can be joined."""
+        """Whether our own vector environments return such an array, so that it can be joined."""
         if name != "rewards":
             return _flags(part)
-        # several for each sub-environment are what AsyncVectorEnv permits
+        # AsyncVectorEnv permits several rewards for each sub-environment
         return bool(part.ndim == 1 or not self.manifest.sync)
 
 
 def _own_infos(value: Any, size: int) -> Sequence[OwnInfo]:
-    """Trust: input from the worker."""
+    """Check the infos of one shard, each with index and forms. Trust: input from the worker."""
     each: Any = value if type(value) is tuple else (None,)
     for own in each:
         if type(own) is not tuple or list(map(type, own)) != [int, dict, dict]:
@@ -270,9 +272,9 @@ def _own_infos(value: Any, size: int) -> Sequence[OwnInfo]:
 
 
 def all_replies(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:
-    """The shards' replies, which must be of this kind, or of one of these.
-    Raises ``EnvHubError``: the repository raised, in any of the shards; ``RemoteProtocolError``: a
-    message is of another kind.
+    """Return the shards' replies if all are of this kind, or of one of several.
+    Raises ``EnvHubError``: the repository raised in any shard; ``RemoteProtocolError``: a reply is
+    of another kind.
     """
     others = [reply for reply in replies if type(reply) is not kind]
     for reply in others:
@@ -283,15 +285,15 @@ def all_replies(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M],
 
 
 def is_batch(part: Any) -> bool:
-    """Whether this is an array or a tensor. A space that is described has a shape, too."""
+    """Whether this is an array or a tensor. A shape alone does not tell: a space has one, too."""
     return isinstance(part, np.ndarray) or hasattr(type(part), "__array__")
 
 
 def _numeric(part: Any) -> bool:
-    """Whether these are numbers or booleans; a tensor's always are."""
+    """Whether this is a batch of numbers or booleans, as a tensor always is."""
     return is_batch(part) and (not isinstance(part, np.ndarray) or part.dtype.kind in "biuf")
 
 
 def _flags(part: Any) -> bool:
-    """Whether this is one boolean each."""
+    """Whether this is an array of booleans in one dimension."""
     return isinstance(part, np.ndarray) and part.dtype.kind == "b" and part.ndim == 1

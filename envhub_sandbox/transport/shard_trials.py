@@ -1,16 +1,16 @@
-"""Over how many processes an environment's work is spread: what was fastest when it was tried.
+"""Chooses over how many processes to spread an environment, by trials of what is fastest.
 
-Sub-environments that share a process share its global generators, its module and class attributes,
-and whatever else a process has once. So a synchronous environment has one process, as
-``SyncVectorEnv``, and an asynchronous one has a process for each sub-environment, as
-``AsyncVectorEnv``, unless these were shown to be independent (``runner/independence.py``). Only
-then is there a choice, which changes no result.
+Sub-environments in one process share its global generators, its module and class attributes, and
+all other state that a process has once. So a synchronous environment has one process, as with
+``SyncVectorEnv``, and an asynchronous environment has a process for each sub-environment, as with
+``AsyncVectorEnv``. Only if the sub-environments were shown to be independent
+(``runner/independence.py``), this module may choose another number, which changes no result.
 
-Each use of a pin cuts its sub-environments into shards in one way, and notes how long a step took.
-The first uses try one way after the other, those that follow have the fastest. Fewer shards win
-where they are nearly as fast: they take less memory, and start sooner. All is tried again where the
-number of cores is another one, or where the same way has become much slower or faster: the load is
-another one then, or the machine.
+Each use of a pin cuts its sub-environments into shards in one way, and notes the time of a step.
+The first uses try one way after the other; later uses take the fastest. If fewer shards are nearly
+as fast, they win, because they take less memory and start sooner. The trials begin again if the
+number of cores changes, or if the same way becomes much slower or faster, because then the load or
+the machine has changed.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.batches import even_bounds
 
 LEAST_STEPS = 32
-"""Fewer steps say nothing about speed."""
+"""A use with fewer steps notes no time, because they say nothing about speed."""
 ENOUGH_STEPS = 512
-"""After so many steps their time is noted, and once more at the end."""
+"""The time of a step is noted after so many steps, and again when the environment closes."""
 _NEARLY = 1.03
-"""So much slower counts as equal."""
+"""A way that is slower by at most this factor counts as equally fast."""
 HOPELESS = 1.2
-"""Where half as many shards are so much slower than the best, still fewer are not tried."""
+"""If half as many shards are slower than the best by this factor, fewer are not tried."""
 _ANOTHER_LOAD = 1.5
-"""So much slower or faster than the last time is no noise."""
+"""A change of the time by more than this factor is not noise."""
 
 Bounds = list[tuple[int, int]]
 
 
 class ShardTrials:
-    """How long the steps of the environments of one manifest took, in a file beside it.
-    ``path``: the file, or None for what must not be remembered.
-    ``apart``: whether sub-environments that seemed to be independent were found not to be.
+    """The step times of one manifest's environments, in a file beside the manifest.
+    ``path``: the file, or None to remember nothing.
+    ``apart``: whether sub-environments that seemed independent were later found to share state.
     """
 
     def __init__(self, path: Path | None, *, apart: bool = False) -> None:
@@ -51,8 +51,8 @@ class ShardTrials:
         self._cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
 
     def bounds_for(self, env: EnvManifest, num_workers: int | None) -> Bounds:
-        """The slices of the sub-environments, one for each of ``num_workers`` shards, or of as
-        many as are useful.
+        """The slices of the sub-environments, one for each shard: ``num_workers`` shards if given,
+        else as many as the trials say.
         """
         if not env.shardable or (num_workers is None and env.sync):
             return even_bounds(env.num_envs, 1)
@@ -73,20 +73,20 @@ class ShardTrials:
         return [bounds for step_s, bounds in tried if step_s <= enough][-1]
 
     def may_share(self, env: EnvManifest) -> bool:
-        """Whether sub-environments in one process give the same as with a process each."""
+        """Whether sub-environments give the same results in one process as in one each."""
         return env.sync or (env.independent and not self._apart)
 
     def note(self, env: EnvManifest, bounds: Bounds, step_s: float) -> None:
-        """Remember what a step took. A cache that cannot be written is no error."""
+        """Remember the time of a step. Failing to write the cache is no error."""
         chosen = not env.sync and env.num_envs > 1 and self.may_share(env)
         if self._path is None or not chosen or not _is_sane(step_s):
-            return  # it must not be remembered, or there is no choice
+            return  # the time must not be remembered, or there is no choice
         entries = self._read()
         times, name = self._times(entries, env), _name(bounds)
         slower = step_s / times.get(name, step_s)
         if slower * _ANOTHER_LOAD < 1:
             times = {}
-        elif slower > _ANOTHER_LOAD:  # what was far slower on a quieter machine is so here, too
+        elif slower > _ANOTHER_LOAD:  # keep, scaled, only ways that were far slower anyway
             far = {
                 key: seconds
                 for key, seconds in times.items()
@@ -114,11 +114,11 @@ class ShardTrials:
 
 
 def ways_to_cut(count: int, cores: int) -> list[Bounds]:
-    """The ways that are tried, in their order: a shard for each core first, a single one last."""
+    """The ways to cut, in the order of trials: from a shard for each core down to one shard."""
     most = max(1, min(count, cores))
     ways = [even_bounds(count, most)]
     less = count // most * 3 // 4
-    if most == cores > 1 and less:  # the last one shares its core with the client
+    if most == cores > 1 and less:  # the last shard shares its core with the client
         ways.append([*even_bounds(count - less, most - 1), (count - less, count)])
     if most == cores > 2:
         ways.append(even_bounds(count, most - 1))

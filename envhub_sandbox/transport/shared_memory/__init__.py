@@ -1,1 +1,1 @@
-"""Lanes that step through slabs, which a runner shares with the client or with the server."""
+"""Lanes that step through slabs: memory that a runner shares with the client or the server."""

@@ -1,4 +1,4 @@
-"""Who holds the other ends of the slabs and doorbells: handed over, watched, and waited for."""
+"""Gives the slabs and doorbells of shards to their runners, and watches these runners."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from envhub_worker.protocol.shared_memory.descriptors import Watch
 
 _ANSWER_S = 20.0
 _LEAST_S = 0.1
-"""How long a server may take at most to take descriptors, and at least, so late as it is."""
+"""The most time that a server gets to take descriptors, and the least, however late it is."""
 _TRIES = 3
 _AGAIN_S = 0.005
 
 
 class Attachment:
-    """The runners of one environment's shards, as far as they share memory with us.
+    """The runners of one environment that share memory with this process.
 
     Args:
         path: The socket at which the server takes descriptors.
-        jail: The number of their jail.
-        process_fd: Readable once the worker server has ended.
+        jail: The number of the runners' jail.
+        process_fd: A descriptor that becomes readable when the worker server ends.
 
     Attributes:
-        watch: Wakes up at their rings, and at the death of any of them, or of the server.
+        watch: Wakes up when a runner rings its doorbell, or when a runner or the server ends.
     """
 
     def __init__(self, path: str, jail: int, process_fd: int) -> None:
@@ -41,10 +41,10 @@ class Attachment:
         self.watch.death(process_fd)
 
     def hand_over(self, index: int, runner: int, shard: LaneShard, deadline: Deadline) -> None:
-        """Give a shard's runner its ends.
+        """Give a shard's runner its ends of the slabs and doorbells.
 
         Raises:
-            WorkerDiedError: There is no such runner any more, or no server.
+            WorkerDiedError: The runner or the server has ended.
         """
         # In this order. The bell is watched before a runner can ring it. The server gives the pidfd
         # in exchange for the descriptors, so the death that we watch is that of their new holder;
@@ -64,14 +64,14 @@ class Attachment:
         shard.handed_over()
 
     def forget(self, index: int, shard: LaneShard) -> None:
-        """A shard's runner has died: what it still may ring is heard no more."""
+        """Stop watching a shard's runner, which has died, and its doorbell."""
         pidfd = self._pidfds.pop(index)
         self.watch.forget(pidfd)
         os.close(pidfd)
         self.watch.forget(shard.bell)
 
     def answers(self, index: int, shard: LaneShard, deadline: Deadline) -> bool:
-        """Whether a shard's answer comes before its runner's death; raises as that."""
+        """Wait for a shard; returns whether it answers before its runner dies."""
         watch = Watch()
         watch.bell(shard.bell)
         watch.death(self._pidfds[index])
@@ -81,7 +81,7 @@ class Attachment:
             watch.close()
 
     def close(self) -> None:
-        """Let go of them."""
+        """Stop watching all runners."""
         self.watch.close()
         for index, pidfd in list(self._pidfds.items()):
             del self._pidfds[index]  # interruption.md, rule 4
@@ -93,11 +93,11 @@ def deposit(
 ) -> int:
     """Hand descriptors to the server for a runner; returns a pidfd of the jail, or of the runner.
 
-    The server waits a second for what a connection brings, and for nothing else meanwhile. If the
-    garbage collector closes another environment between our connecting and our sending, it waits
-    for that server in turn, and the connection is gone. So it is tried again: the same descriptors
-    for the same runner take the place of what was there. A server that has not heard of the jail
-    from its zygote, which may be held up, says so, and is asked again as well.
+    The server waits for one second for a connection's message, and does nothing else meanwhile. If
+    the garbage collector closes another environment between our connect and our send, it waits for
+    that same server, which drops the connection. So a failed deposit is repeated: descriptors for
+    the same runner replace those of the first try. A server that has not yet heard of the jail
+    from its zygote says so, and is asked again, too.
 
     Raises:
         OSError: The server did not take them.
@@ -120,7 +120,7 @@ def deposit(
 
 
 def _deposit(path: str, frame: bytes | memoryview, fds: Sequence[int], wait_s: float) -> int | None:
-    """One try; None if the server does not know yet."""
+    """Try once to hand over descriptors; None if the server does not know the jail yet."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(wait_s)
         connection.connect(path)

@@ -1,17 +1,17 @@
-"""The client's end of the slabs: actions and messages are written, and what runners wrote is read.
+"""The client's end of the slabs: writes actions and messages, and reads the runners' answers.
 
 A shard in shared memory has two sealed memfds and a doorbell each way (``LaneShard``), and all
-shards write into one slab of observations (``ObservationSlab``). Where a server has the slabs, it
-sends what it reads of them (``served_lane``). Trust: the jail writes its slabs whenever it likes,
-so every word is read once and bounded, and bytes are copied before they are looked at.
-``F_SEAL_SHRINK`` keeps the jail from cutting the memory away under us (which would be a SIGBUS).
+shards write into one slab of observations (``ObservationSlab``). If the server has the slabs, it
+sends their contents (``served_lane``). Trust: the jail can write its slabs at any time, so every
+word is read once and bounded, and bytes are copied before they are checked. ``F_SEAL_SHRINK`` keeps
+the jail from shrinking the memory, which would be a SIGBUS for us.
 
-Observations are copies that the caller owns, or slots that it borrows. With one slot every batch is
-copied out. With a ring of slots (``copy=False``) a batch is handed out where it lies, and its slot
-is written again only when no array of it is held any more: each slot is a map of its own, which is
-the base of every array over it, views of views included, so that its reference count tells. When
-all are held, the batch goes through the spare slot and is copied. A borrowed batch lies in memory
-that the jail can still write.
+The caller owns copies of observations, or borrows slots. With one slot every batch is copied out.
+With a ring of slots (``copy=False``) the caller gets arrays over the slot itself. The slot is
+written again only when no such array is referenced any more: each slot is a map of its own and the
+base of every array over it, including views of views, so its reference count shows that. If all
+slots are held, the batch goes through the spare slot and is copied. The jail can still write the
+memory of a borrowed batch.
 """
 
 from __future__ import annotations
@@ -52,23 +52,23 @@ if TYPE_CHECKING:
     from envhub_worker.protocol.shared_memory.descriptors import Watch
 
 Schema = list[tuple[slabs.Column, Any]]
-"""What columns infos have, and where each lies in a slab."""
+"""The columns of infos, each with its view of the slab."""
 Outcome = tuple[int, m.Message | None]
-"""``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and what came encoded."""
+"""``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and the message in the slab, if any."""
 NO_MORE: Outcome = (slabs.DONE, None)
-"""Results and nothing else."""
+"""The outcome of a step without infos."""
 _OUTCOMES = frozenset({slabs.DONE, slabs.RAISED, slabs.FETCH, slabs.COLUMNS})
 _UNKNOWN = -1
 RING = 4
-"""Slots that are handed out: the last two batches, and two that a caller keeps."""
+"""The number of slots to lend: for the last two batches, and two that a caller keeps."""
 _SPARE = 0
 Wishes = tuple[int, int, int]
-"""Which slot the observations go to, for how many ns to wait awake afterwards, and one more than
-the core to run on, or 0."""
+"""The slot for the observations, the ns to wait awake afterwards, and the core to run on plus one,
+or 0 for any core."""
 
 
 def action_layouts(results: Results) -> list[slabs.Layout] | None:
-    """Where each shard's actions lie in its slab; None where spaces have no fixed layout."""
+    """Each shard's layout of actions; None if the spaces have no fixed layout."""
     manifest = results.manifest
     space = manifest.single_action_space
     found = [slabs.layout_of(space, stop - start) for start, stop in results.bounds]
@@ -77,8 +77,8 @@ def action_layouts(results: Results) -> list[slabs.Layout] | None:
 
 
 def message_layouts(results: Results, slots: int) -> list[tuple[slabs.Layout, int]] | None:
-    """The same where steps are messages, with the size of a slot for an answer; None where these
-    are too large.
+    """Each shard's layout for steps as messages, and the size of a slot for an answer; None if
+    these are too large.
     """
     manifest, layouts = results.manifest, []
     observed, acted = manifest.single_observation_space, manifest.single_action_space
@@ -96,16 +96,16 @@ def message_layouts(results: Results, slots: int) -> list[tuple[slabs.Layout, in
 class ShardSlabs:
     """The request slab and the reply slab of one shard.
 
-    What is remembered of a slab is forgotten before it is written, and noted again afterwards:
-    docs/internals/interruption.md, rule 3.
+    A field that remembers a slab's content is cleared before the slab is written, and set again
+    afterwards: docs/internals/interruption.md, rule 3.
 
     Args:
-        layout: Where everything lies.
+        layout: The layout of the request slab.
         request: The memory of the request slab.
         reply: The memory of the reply slab.
 
     Attributes:
-        told_bytes, answer_bytes: What messages and their answers have taken so far.
+        told_bytes, answer_bytes: The total bytes of messages and of their answers so far.
     """
 
     def __init__(self, layout: slabs.Layout, request: Any, reply: Any) -> None:
@@ -132,9 +132,9 @@ class ShardSlabs:
 
     def write(self, leaves: Sequence[Any], wishes: Wishes) -> None:
         """Write a shard's actions."""
-        only = leaves[0] if leaves else None  # of a space without members there is nothing
+        only = leaves[0] if leaves else None  # a space without members has none
         if type(only) is np.ndarray and only.dtype is self._dtype and not self._told:
-            self._only[...] = only  # as the last time, which it usually is
+            self._only[...] = only  # the usual case: the same dtype as in the last step
         else:
             self._write(leaves)
         if wishes != self._wishes:
@@ -164,12 +164,12 @@ class ShardSlabs:
                 self._dtype = array.dtype
 
     def has_room(self, frames: Frames) -> bool:
-        """Whether a message fits."""
+        """Whether a message fits into the request slab."""
         return packet_bytes(frames) <= self.layout.request_bytes - self.layout.message
 
     def write_message(self, frames: Frames, wishes: Wishes, slots: SlotRing | None = None) -> None:
-        """Write a message that ``has_room`` in the place of actions.
-        ``slots``: where the answer goes, into the chosen one; else it goes into the reply slab.
+        """Write a message, for which it ``has_room``, in the place of actions.
+        ``slots``: the ring whose chosen slot gets the answer; None for the reply slab.
         """
         asks, start = self._asks, self.layout.message
         self._told, self._actions = True, None
@@ -184,8 +184,8 @@ class ShardSlabs:
             self._wish(*wishes)
 
     def note_actions(self, actions: Any) -> None:
-        """The message is a step with these: if they are one array, others like it can be written
-        in their place (``write_actions``).
+        """Note the actions of the step that was written as a message: if they are one array,
+        ``write_actions`` can write later actions of the same form in their place.
         """
         frames, self._told_frames = self._told_frames, []
         if type(actions) is not np.ndarray or actions.dtype.kind not in "biufc":
@@ -195,7 +195,7 @@ class ShardSlabs:
             self._actions = np.ndarray(actions.shape, actions.dtype, self._request, start)
 
     def write_actions(self, actions: Any, wishes: Wishes, slots: SlotRing) -> bool:
-        """Write a step into the message that lies there, if that is one with such actions."""
+        """Write actions into the last message, if it is a step with such actions; whether it is."""
         array = self._actions
         if array is None or type(actions) is not np.ndarray or actions.dtype is not array.dtype:
             return False
@@ -227,18 +227,18 @@ class ShardSlabs:
 
     @property
     def known(self) -> int:
-        """Bytes of infos that the columns take."""
+        """The bytes that the columns of infos take."""
         return self._asks[slabs.KNOWN]
 
     def has_nothing_to_say(self) -> bool:
-        """Whether the reply is results and nothing else."""
+        """Whether the reply has results only, without infos."""
         tells = self._tells
         return tells[slabs.OUTCOME] == slabs.DONE and not tells[slabs.LENGTH]
 
     def outcome(self) -> Outcome:
-        """How the request went. Trust: input from the worker; the length is bounded here.
+        """The outcome of the request. Trust: input from the worker; the length is bounded here.
 
-        What came encoded is decoded at once, wanted or not: the columns that follow are its.
+        An encoded message is always decoded, since it may have the schema of later columns.
         """
         kind, length = self._tells[slabs.OUTCOME], self._tells[slabs.LENGTH]
         if kind not in _OUTCOMES or length > slabs.INFO_BYTES:
@@ -247,7 +247,7 @@ class ShardSlabs:
             return kind, None
         start = slabs.INFOS
         message = unpacked([self._reply[start : start + length]])
-        if isinstance(message, m.RaisedException):  # which it may call something else
+        if isinstance(message, m.RaisedException):  # whatever kind the worker wrote
             return slabs.RAISED, message
         if isinstance(message, m.Value) and type(message.value) is dict:
             with UNTRUSTED:
@@ -292,8 +292,8 @@ class ShardSlabs:
         return columns.read(*slots.whole, packed, to_tensor, slots.borrowed)
 
     def checked_step(self) -> list[Any] | None:
-        """The fields of the answer to a step, if it came as columns that ``note_checked`` was said
-        of; as ``answer``.
+        """The fields of a step's answer, if it has columns of a form that ``note_checked`` noted;
+        else None. Raises as ``answer``.
         """
         tells, slots, columns = self._tells, self._answer_slots, self._step_columns
         if columns is None or columns is not self._checked_form or slots is None:
@@ -303,7 +303,7 @@ class ShardSlabs:
         return self._step_of_columns(tells[slabs.LENGTH], slots)
 
     def note_checked(self) -> None:
-        """The classes, dtypes and shapes of the last answer, a step's, are as declared."""
+        """Note that the classes, dtypes and shapes of the last step's answer are as declared."""
         if self._form is not None:
             self._checked_form = self._form
 
@@ -316,11 +316,11 @@ class ShardSlabs:
 
     @property
     def schema(self) -> Schema:
-        """The columns of the infos, which another list follows with the next schema."""
+        """The columns of the infos; a new schema makes a new list."""
         return self._columns if self._own is None else []
 
     def columns(self) -> dict[Any, Any]:
-        """Infos that came as columns: fresh arrays."""
+        """The infos that came as columns, copied into new arrays."""
         if not self._columns:
             raise RemoteProtocolError("the worker sent columns before their schema")
         columns = {column.key: view.astype(column.dtype) for column, view in self._columns}
@@ -332,33 +332,32 @@ class ShardSlabs:
         return {**self._own, **dict(own)}
 
     def close(self) -> None:
-        """Give everything back."""
+        """Release the views; the maps go with the last array over them."""
         self._asks.release()
         self._tells.release()
         self._answers.release()
-        # the maps go with the last array over them
 
 
 def _members(known: Any, column: Any) -> Sequence[Any]:
-    """A column's values as its schema had one: of Python's class, or numpy's."""
+    """A column's values, in the class of the schema's value: Python's or numpy's."""
     kept = isinstance(known, (np.generic, np.ndarray))
     return list(column) if kept else column.tolist()
 
 
 class LaneShard(ShardSlabs):
-    """The slabs and doorbells of one shard.
+    """The slabs and doorbells of one shard, in memory shared with its runner.
 
     Args:
-        layout: Where everything lies.
+        layout: The layout of the request slab.
         observations: The descriptor of the slab that all shards share.
 
     Attributes:
-        fds: What the runner gets: three slabs, its doorbell, ours.
-        bell: Our doorbell, to be watched.
+        fds: The descriptors for the runner: three slabs, its doorbell and ours.
+        bell: Our doorbell, which the runner rings.
     """
 
     def __init__(self, layout: slabs.Layout, observations: int) -> None:
-        # late, for Linux alone has what these import
+        # imported late: only Linux has these modules' dependencies
         from envhub_worker.protocol.shared_memory.descriptors import (
             SEAL_FUTURE_WRITE,
             OwnBell,
@@ -377,13 +376,13 @@ class LaneShard(ShardSlabs):
         self.sequence = 0
 
     def handed_over(self) -> None:
-        """The runner has its copies of the descriptors; the maps keep ours alive."""
+        """Close our copies of the runner's descriptors; the maps keep the memory alive."""
         while self._slab_files:
             self._slab_files.pop().close()
         self._runner_bell.handed_over()
 
     def announce(self) -> None:
-        """Have the runner read what was written."""
+        """Tell the runner that a request is written; ring its doorbell if it sleeps."""
         self.sequence += 1
         self._asks[slabs.SEQUENCE] = self.sequence
         if self._tells[slabs.PARKED]:
@@ -394,11 +393,11 @@ class LaneShard(ShardSlabs):
         return self._tells[slabs.SEQUENCE] == self.sequence
 
     def listen(self, wanted: bool) -> None:
-        """Whether we want our doorbell rung. A ring may cross with this: look again soon, once."""
+        """Say whether to ring our doorbell. An answer may come just before: look again soon."""
         self._asks[slabs.PARKED] = wanted
 
     def answered_until(self, until_ns: int) -> bool:
-        """Whether it comes before that time; waits awake."""
+        """Wait awake for the reply; returns whether it came before ``until_ns``."""
         tells, sequence = self._tells, self.sequence
         while tells[slabs.SEQUENCE] != sequence:
             if perf_counter_ns() > until_ns:
@@ -406,18 +405,18 @@ class LaneShard(ShardSlabs):
         return True
 
     def has_more_elsewhere(self) -> bool:
-        """Whether a part of the reply did not fit, and has to be fetched."""
+        """Whether a part of the reply did not fit the slab and has to be fetched."""
         return self._tells[slabs.OUTCOME] == slabs.FETCH
 
     def answered_before_death(self, watch: Watch, deadline: Deadline) -> bool:
-        """Sleep until the reply is there, or a process dies; whether it is there.
+        """Sleep until the reply is there or a process dies; returns whether the reply is there.
 
         Raises:
             WorkerTimeoutError: The deadline came first.
         """
-        self._asks[slabs.PARKED] = 1  # we want our doorbell rung
+        self._asks[slabs.PARKED] = 1  # ask the runner to ring our doorbell
         try:
-            # a ring may cross with our going to sleep: look again soon, once
+            # the runner may have answered just before PARKED was set: look again soon, once
             timeout: int | None = RECHECK_MS
             while not self.answered():
                 died = watch.wait(timeout)
@@ -433,7 +432,7 @@ class LaneShard(ShardSlabs):
             self._asks[slabs.PARKED] = 0
 
     def close(self) -> None:
-        """Give everything back."""
+        """Close the doorbells and descriptors, and release the slabs."""
         self.handed_over()
         self._runner_bell.close()
         self.bell.close()
@@ -441,17 +440,17 @@ class LaneShard(ShardSlabs):
 
 
 class JoinedColumns:
-    """The infos of all shards, where all of them came as the same columns: one copy each.
+    """Joins the infos of all shards, if all came as the same columns, with one copy of each column.
 
-    With many shards this is most of what is left of a step that has infos.
+    With many shards, joining takes most of the time of a step with infos.
 
     Args:
-        schemas: Each shard's.
-        bounds: The sub-environments of each, from and to.
+        schemas: The schema of each shard.
+        bounds: The slice of sub-environments of each shard.
 
     Attributes:
-        columns: Name, shape, dtype and each shard's part; empty where the schemas differ, or one
-            does not have a value for each sub-environment.
+        columns: Name, shape, dtype and the shards' parts of each column; empty if the schemas
+            differ, or if a column lacks a value for some sub-environment.
     """
 
     def __init__(self, schemas: Sequence[Schema], bounds: Sequence[tuple[int, int]]) -> None:
@@ -465,12 +464,12 @@ class JoinedColumns:
                 self.columns.append((key, (bounds[-1][1], *tail), dtype, parts))
 
     def is_of(self, schemas: Sequence[Schema]) -> bool:
-        """Whether it was made of these."""
+        """Whether it was made of these schemas."""
         known = self._schemas
         return len(known) == len(schemas) and all(map(operator.is_, known, schemas))
 
     def infos(self) -> dict[Any, Any]:
-        """Fresh arrays. Trust: each byte is read once; what is not 0 in a mask is true."""
+        """The joined infos, in new arrays. Trust: reads each byte once; a nonzero mask is true."""
         return {
             key: np.concatenate(parts, out=np.empty(shape, dtype), casting="unsafe")
             for key, shape, dtype, parts in self.columns
@@ -478,7 +477,7 @@ class JoinedColumns:
 
 
 def infos_of(shard: ShardSlabs, outcome: Outcome, results: Results) -> dict[Any, Any]:
-    """A shard's infos of a step, all of which are here. Trust: input from the worker.
+    """A shard's infos of a step, all of which have arrived. Trust: input from the worker.
 
     Raises:
         RemoteEnvError: The environment raised.
@@ -488,19 +487,19 @@ def infos_of(shard: ShardSlabs, outcome: Outcome, results: Results) -> dict[Any,
 
 
 class SlotRing:
-    """A slab of slots, of which the next batch goes into one that nobody holds.
+    """A slab of slots; each batch goes into a slot that no caller holds.
 
     Args:
-        count, slot_bytes, total_bytes: Their number, the size of each and of the slab.
+        count, slot_bytes, total_bytes: The number of slots, the size of each, and of the slab.
 
     Attributes:
-        fd: Its descriptor, for the runners.
+        fd: The slab's descriptor, for the runners.
         count, slot_bytes: As given.
         chosen: The slot of the last batch.
     """
 
     def __init__(self, count: int, slot_bytes: int, total_bytes: int) -> None:
-        # late, for Linux alone has what it imports
+        # imported late: only Linux has this module's dependencies
         from envhub_worker.protocol.shared_memory.descriptors import sealed_memfd
 
         self.count, self.slot_bytes = count, slot_bytes
@@ -511,12 +510,12 @@ class SlotRing:
         else:
             offsets = range(0, count * slot_bytes, slot_bytes)
             self._slots = [mmap.mmap(self.fd, slot_bytes, offset=offset) for offset in offsets]
-        # counted just as choose() does: a loop's variable would be one more
+        # counted exactly as in choose(): a loop variable would add a reference
         self._unheld = [sys.getrefcount(self._slots[index]) for index in range(len(self._slots))]
         self.chosen = _SPARE
 
     def choose(self) -> int:
-        """The slot for the next batch: the lowest that is not held, so that few stay hot."""
+        """Choose the slot for the next batch: the lowest free one, so that few slots stay hot."""
         self.chosen = _SPARE
         for index in range(1, len(self._slots)):
             if sys.getrefcount(self._slots[index]) == self._unheld[index]:
@@ -525,25 +524,25 @@ class SlotRing:
         return self.chosen
 
     def leave(self) -> None:
-        """The next batch comes another way: the runners leave the slot that may be held."""
+        """Choose the spare slot, so that no held slot is written: the next batch is a message."""
         self.chosen = _SPARE
 
     @property
     def whole(self) -> tuple[Any, int]:
-        """The memory of all slots, views of which hold none, and where the chosen one begins."""
+        """The memory of all slots, whose views hold no slot, and the offset of the chosen slot."""
         return self._memory, self.chosen * self.slot_bytes
 
     @property
     def borrowed(self) -> Any:
-        """The chosen slot, if the batch in it is handed out where it lies; else None."""
+        """The chosen slot, if the caller borrows the batch in it; None if the batch is copied."""
         return None if self.chosen == _SPARE else self._slots[self.chosen]
 
     def bytes_of_chosen(self) -> memoryview:
-        """The memory of the chosen slot, which counts as held while there is a view of it."""
+        """A view of the chosen slot, which counts as held while the view exists."""
         return memoryview(self._slots[self.chosen])[: self.slot_bytes]
 
     def close(self) -> None:
-        """Give the descriptor back; the memory goes with the last array over it."""
+        """Close the descriptor; the memory goes with the last array over it."""
         self._file.close()
 
 
@@ -552,10 +551,10 @@ class ObservationSlab(SlotRing):
 
     Args:
         space: The single observation space.
-        layout: Where everything lies.
+        layout: The layout of the slab.
 
     Attributes:
-        layout: Where everything lies.
+        layout: As given.
     """
 
     def __init__(self, space: gym.Space[Any], layout: slabs.ObservationLayout) -> None:
@@ -579,7 +578,7 @@ class ObservationSlab(SlotRing):
 
     def results(self) -> tuple[Any, Any, Any]:
         """Copies of rewards (float64), terminations and truncations (bool), ``(num_envs,)``."""
-        # cast, not viewed: a hostile byte of 2 would make a bool that is neither
+        # cast, not viewed as bool: a hostile byte of 2 would be neither True nor False
         flags = self._flags.astype(np.bool_)
         count = self.layout.count
         return self._rewards.copy(), flags[:count], flags[count:]
@@ -587,7 +586,7 @@ class ObservationSlab(SlotRing):
 
 def _copier(slot: Any, leaf: slabs.Leaf) -> Callable[[], Any]:
     if leaf.dtype.kind == "b":
-        # a hostile byte of 2 would make a boolean that is neither
+        # cast, not viewed as bool: a hostile byte of 2 would be neither True nor False
         return partial(slabs.view(slot, leaf, np.dtype(np.uint8)).astype, np.bool_)
     return slabs.view(slot, leaf).copy
 

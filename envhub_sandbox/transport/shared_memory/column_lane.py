@@ -1,6 +1,7 @@
-"""The fast lane of plain sub-environments with spaces of a fixed layout: steps in columns.
+"""The lane in shared memory for spaces with a fixed layout: steps are columns, not messages.
 
-A step costs one wake-up per shard and one copy out. Infos that did not fit go over the server.
+A step costs one wake-up per shard and one copy of the results. Infos that do not fit the slab come
+over the server.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ _ANY_CPU = [0]
 
 
 class ColumnLane(ColumnSteps, SharedMemoryLane):
-    """See ``ColumnSteps`` and ``SharedMemoryLane``.
+    """Steps in columns (``ColumnSteps``), messages as in ``SharedMemoryLane``.
 
     Args:
-        observed: Where the observations lie.
+        observed: The layout of the observations.
     """
 
     shards: list[LaneShard]
@@ -59,7 +60,7 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
     def open(
         cls, relay: Lane, attach: Callable[[], Attachment], deadline: Deadline, *, slots: int
     ) -> SharedMemoryLane | None:
-        """See ``SharedMemoryLane``; None also where the spaces have no fixed layout."""
+        """As ``SharedMemoryLane.open``; None also if the spaces have no fixed layout."""
         results = relay.declared
         space = results.manifest.single_observation_space
         observed = slabs.observation_layout(space, results.count, slots)
@@ -73,7 +74,7 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
         return m.Attach(self.number, self._bounds[index][0], layout.count, layout.slots)
 
     def _fresh_slots(self, index: int) -> SlotRing:
-        return self.observations  # the others write there, too
+        return self.observations  # all shards write into this one slab
 
     def _slot_for(self, operation: str, index: int) -> tuple[int, SlotRing | None]:
         if operation == "reset" and not index:
@@ -81,17 +82,17 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
         return self.observations.chosen, None
 
     def send_step(self, actions: Any, *, ahead: bool = False) -> None:
-        """See ``Lane``."""
-        self._asked = STEP  # interruption.md, rule 1: first
+        """Implements ``Lane.send_step``."""
+        self._asked = STEP  # interruption.md, rule 1: before anything is sent
         self._steps += 1
         rows = self._rows(actions)
         self._asked_ns = perf_counter_ns()
         self._spin = self._step_spin
         spin_ns = self._spin.budget_ns
         slot = self.observations.choose()
-        # one shard alone is left to the kernel
+        # the kernel chooses the core of a single shard
         cpus = self._cores.of_shards() if len(self.shards) > 1 else _ANY_CPU
-        # the first ones start while the last ones are still asked: with many, each moment counts
+        # each shard starts as soon as its actions are written, while the next are still written
         for index, (shard, leaves, cpu) in enumerate(zip(self.shards, rows, cpus, strict=True)):
             shard.write(leaves, (slot, spin_ns if index < self._awake else 0, cpu))
             shard.announce()
@@ -111,11 +112,11 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
 
     def _drop(self, deaths: dict[int, WorkerDiedError]) -> None:
         if self._asked == STEP:
-            self._read(deaths)  # it may carry the schema of later columns
+            self._read(deaths)  # an outcome may have the schema of later columns
         super()._drop(deaths)
 
     def _as_messages(self, answers: list[m.Message | None]) -> list[m.Message | None]:
-        """See ``SharedMemoryLane``: the observations of a reset lie in the slab."""
+        """Implements ``SharedMemoryLane._as_messages``; a reset's observations are in the slab."""
         if self._asked != "reset":
             return answers
         with UNTRUSTED:
@@ -127,7 +128,7 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
             ]
 
     def traffic(self) -> tuple[int, int, int]:
-        """See ``Lane``; of steps in shared memory, infos are left out."""
+        """Implements ``Lane.traffic``; infos of steps in shared memory are not counted."""
         stale, sent, received = super().traffic()
         there, back = self._step_bytes
         return stale, sent + there * self._steps, received + back * self._steps

@@ -1,7 +1,7 @@
-"""The fast lane: messages over shared memory, straight to the jail's runners; steps are messages.
+"""The lane in shared memory: messages, also steps, go straight to the jail's runners.
 
-What does not fit goes over the server, as on the lane that it derives from. ``ColumnLane`` derives
-from this one, and steps without messages.
+A message that does not fit the slabs goes over the server, as on ``Lane``. ``ColumnLane`` derives
+from this lane, and steps without messages.
 """
 
 from __future__ import annotations
@@ -29,29 +29,31 @@ from envhub_sandbox.transport.shared_memory.slab_lane import STEP, SlabLane
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 
-# elsewhere a core may see the sequence word before the data it announces: sleep, do not poll
+# On other machines a core may see the sequence word before the data that it announces: there we
+# sleep and do not poll.
 _ORDERED_STORES = platform.machine() in ("x86_64", "AMD64")
 BY_SERVER = ""
-"""In place of an operation's name, where it is the relay that is owed the answer."""
+"""The value of ``_asked`` when the answer comes over the server, not through the slabs."""
 _BULKY = frozenset({"render"})
-"""What hardly ever fits the slabs."""
+"""Operations whose answers hardly ever fit the slabs."""
 _BATCHES = frozenset({STEP, "reset"})
 """Operations that return a batch of observations, which goes into a slot."""
 _CAUSE_S = 10.0
-"""For how long the server may take to say how a runner has died."""
+"""How long the server may take to say how a runner died."""
 
 
 class SharedMemoryLane(SlabLane):
-    """Slabs and doorbells, over all shards of one environment: see ``Lane``.
+    """Sends requests through slabs and doorbells, one set for each shard: see ``Lane``.
 
     Args:
-        relay: A lane to the same runners.
-        layouts: Where each shard's actions and messages lie.
-        slots: Of each shard, where the answers to steps lie.
-        attachment: The other ends of the slabs.
+        relay: The lane over the server, to the same runners.
+        layouts: The layout of each shard's request slab.
+        slots: Each shard's ring of slots for the answers to steps.
+        attachment: Gives the other ends of the slabs to the runners.
 
     Attributes:
-        shards, slots: As given.
+        shards: The slabs of each shard.
+        slots: As given.
     """
 
     name = "shared memory"
@@ -72,29 +74,30 @@ class SharedMemoryLane(SlabLane):
         self._watch = attachment.watch
         self._asked = BY_SERVER
         results, manifest = self.declared, self.declared.manifest
-        # as many workers of the same environment are on this machine, or may be
+        # the other workers of the same environment may be on this machine
         workers = -(-manifest.num_envs // results.count)
         may_spin = _ORDERED_STORES and workers < len(own_cpus())
         self._spin = self._step_spin = SpinChooser(may_spin)
-        self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
-        self._checked: list[Any] | None = None  # a step that needs no further check
+        self._talk_spin = SpinChooser(may_spin)  # messages take longer than steps
+        self._checked: list[Any] | None = None  # fields of a step that needs no check
         self._listens = False
-        # One core is the client's. Shards that find no other sleep until they are asked, then run
-        # on the client's while it sleeps: so it waits for those first, and for the others awake.
+        # One core is the client's. Shards without a core of their own (the sleepers) sleep until a
+        # request comes, then run on the client's core while it sleeps. So the client sleeps for
+        # the sleepers first, and then waits awake for the others (the wakers).
         self._cores = Cores(len(self.shards))
         self._awake = self._cores.awake
         self._sleepers = self.shards[self._awake :]
         self._wakers = self.shards[: self._awake]
 
-    # --- agreed on -----------------------------------------------------------------------------
+    # --- attaching -----------------------------------------------------------------------------
 
     @classmethod
     def open(
         cls, relay: Lane, attach: Callable[[], Attachment], deadline: Deadline, *, slots: int
     ) -> SharedMemoryLane | None:
-        """A lane with fresh slabs; None where they would be too large, or a runner refuses.
-        ``slots``: how many batches there is room for; one is copied out, of several each is handed
-        out where it lies.
+        """Make a lane with new slabs; None if they would be too large, or a runner refuses.
+        ``slots``: the number of slots for batches; with one, each batch is copied out, with
+        several, the caller borrows the slots.
 
         Raises:
             WorkerError: A runner died, or took too long.
@@ -106,7 +109,7 @@ class SharedMemoryLane(SlabLane):
         return cls(relay, [layout for layout, _ in layouts], rings, attach()).agreed(deadline)
 
     def agreed(self, deadline: Deadline) -> SharedMemoryLane | None:
-        """The lane, if all runners attach the slabs; else it is closed."""
+        """Attach the runners; returns the lane, or closes it and returns None if one refuses."""
         agreed = False
         try:
             agreed = self._attach(range(len(self.shards)), deadline)
@@ -116,7 +119,7 @@ class SharedMemoryLane(SlabLane):
         return self if agreed else None
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
-        """See ``Lane``; they get slabs that the dead never saw."""
+        """Implements ``Lane.renew``; new runners get new slabs, which the dead ones never saw."""
         super().renew(dead, fresh, deadline)
         for index in dead:
             old = self.shards[index]
@@ -130,16 +133,21 @@ class SharedMemoryLane(SlabLane):
             raise RemoteProtocolError("a fresh runner refuses the fast lane that others take")
 
     def _attach(self, shards: Sequence[int], deadline: Deadline) -> bool:
-        """Have the runners of some shards serve these slabs; whether all of them do."""
-        # In this order. ZeroMQ carries no descriptors: so each shard's are deposited with the
-        # server first, which answers with a pidfd. From then on a death is noticed by the watch,
-        # and the client's copies of the descriptors are closed (``hand_over``). Then one ``Relay``
-        # goes to all runners, and takes each one's deposit along with its ``Attach``: no runner can
-        # see the message without the descriptors. Who dies in between is an error of the ``Relay``;
-        # what then still waits in the server is closed there with the jail (``FdStore.drop``).
-        # Nothing goes through the slabs before every runner has answered, for one that refuses
-        # makes all of them use the other lane.
-        # The server keeps one deposit for each runner, which another environment may have as well.
+        """Have the runners of some shards serve their slabs; returns whether all do."""
+        # The order matters:
+        #
+        # 1. Each shard's descriptors are deposited with the server, since ZeroMQ cannot carry
+        #    descriptors. The server answers with a pidfd: from then on the watch notices a death,
+        #    and ``hand_over`` closes the client's copies of the descriptors.
+        # 2. One ``Relay`` goes to all runners. The server adds each runner's deposit to its
+        #    ``Attach``, so no runner sees the message without the descriptors. If a runner dies
+        #    before that, the ``Relay`` fails; the server closes a deposit that is left over
+        #    together with the jail (``FdStore.drop``).
+        # 3. Only when every runner has answered, requests may go through the slabs: if one
+        #    runner refuses, all of them use the other lane.
+        #
+        # The server keeps one deposit for each runner, and another environment may attach the same
+        # runner. So ``attaching`` is held from the first deposit to the last answer.
         messages: list[tuple[int, m.Message]] = []
         with self.jail.attaching:
             for index in shards:
@@ -151,7 +159,7 @@ class SharedMemoryLane(SlabLane):
     def _hand_over(self, index: int, deadline: Deadline) -> None:
         try:
             self._attachment.hand_over(index, self.runners[index], self.shards[index], deadline)
-        except WorkerDiedError as error:  # why, the server knows
+        except WorkerDiedError as error:  # the server knows why
             raise self.jail.cause_of_death("make_env") from error
 
     def _attach_message(self, index: int) -> m.Attach:
@@ -166,13 +174,13 @@ class SharedMemoryLane(SlabLane):
 
     @property
     def takes_more(self) -> bool:
-        """See ``Lane``: there is one slab for what is asked, and one for what is answered."""
+        """Always False: each shard's slabs have room for one request and one answer."""
         return False
 
     def send_step(self, actions: Any, *, ahead: bool = False) -> None:
-        """See ``Lane``."""
+        """Implements ``Lane.send_step``."""
         [shard, *others], ring = self.shards, self.slots[0]
-        if not others and self._asked == STEP:  # as the last time, which it usually is
+        if not others and self._asked == STEP:  # the usual case: the last request was a step
             self._asked_ns = perf_counter_ns()
             self._spin = self._step_spin
             ring.choose()
@@ -192,12 +200,12 @@ class SharedMemoryLane(SlabLane):
                 self.leave_slots()
             super()._send_to_all(operation, packed, ahead=ahead)
             return
-        if operation != STEP:  # which has to cost nothing, and is often sent without this
+        if operation != STEP:  # logging would slow down steps, which often do not come here
             MESSAGES.debug("> %s in shared memory", operation)
-        self._asked = operation  # interruption.md, rule 1: first
+        self._asked = operation  # interruption.md, rule 1: before anything is sent
         self._asked_ns = perf_counter_ns()
         self._spin = self._step_spin if operation == STEP else self._talk_spin
-        # one shard alone is left to the kernel
+        # the kernel chooses the core of a single shard
         cpus = self._cores.of_shards() if len(self.shards) > 1 else [0]
         for index, (shard, frames) in enumerate(zip(self.shards, packed, strict=True)):
             slot, ring = self._slot_for(operation, index)
@@ -212,9 +220,9 @@ class SharedMemoryLane(SlabLane):
         return all(shard.has_room(frames) for shard, frames in pairs)
 
     def _slot_for(self, operation: str, index: int) -> tuple[int, SlotRing | None]:
-        """The slot that a shard's columns go to, and the ring with that for its answer.
+        """The slot for a shard's columns, and the ring whose chosen slot gets its answer.
 
-        What is written must not be held by anyone.
+        No caller may hold the slot that is written.
         """
         ring = self.slots[index] if operation in _BATCHES else None
         if ring is not None:
@@ -222,20 +230,20 @@ class SharedMemoryLane(SlabLane):
         return 0, ring
 
     def wait(self, deadline: Deadline) -> None:
-        """See ``Lane``."""
-        self._checked = None  # that of a step that was interrupted
+        """Implements ``Lane.wait``."""
+        self._checked = None  # an interrupted step may have left it
         if self._asked == BY_SERVER:
             super().wait(deadline)
             return
         deaths = self._wait_for_all(deadline)
-        # of several shards, results are always looked into
+        # the results of several shards have to be joined, so they are always checked
         if self._asked == STEP and not deaths and not self.declared.looks_inside:
             self._checked = self.shards[0].checked_step()
         if self._checked is None:
             self._answers = self._replies(deaths, deadline)
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-        """See ``Lane``. Results of a form that has been checked before are not checked again."""
+        """Implements ``Lane.result``; a form that was checked before is not checked again."""
         checked, self._checked = self._checked, None
         if checked is not None and infos is None:
             observation, rewards, ended, cut, own = checked
@@ -246,17 +254,17 @@ class SharedMemoryLane(SlabLane):
         return done
 
     def leave_slots(self) -> None:
-        """See ``Lane``."""
+        """Implements ``Lane.leave_slots``."""
         for ring in self.slots:
             ring.leave()
 
     def send_for_infos(self, *, failed: bool = False) -> None:
-        """See ``Lane``."""
+        """Implements ``Lane.send_for_infos``, over the server."""
         self._asked = BY_SERVER
         super().send_for_infos(failed=failed)
 
     def replies(self, deadline: Deadline) -> list[m.Message]:
-        """See ``Lane``."""
+        """Implements ``Lane.replies``."""
         if self._asked == BY_SERVER:
             return super().replies(deadline)
         return self._replies(self._wait_for_all(deadline), deadline)
@@ -275,7 +283,7 @@ class SharedMemoryLane(SlabLane):
         return [reply for reply in replies if reply is not None]
 
     def _as_messages(self, answers: list[m.Message | None]) -> list[m.Message | None]:
-        """The answers to a message as they would have come through the server; None of the dead."""
+        """The answers to a message, as the server would send them; None for dead runners."""
         return answers
 
     @property
@@ -292,7 +300,7 @@ class SharedMemoryLane(SlabLane):
         return self._listens and self._watch.wait(0)
 
     def sources(self) -> list[Source]:
-        """See ``Lane``."""
+        """Implements ``Lane.sources``."""
         if self._asked == BY_SERVER or self._fetching[0] == self._asked_ns:
             return super().sources()
         if not self._listens:
@@ -305,36 +313,39 @@ class SharedMemoryLane(SlabLane):
             shard.listen(wanted)
 
     def catch_up(self, deadline: Deadline) -> None:
-        """See ``Lane``."""
+        """Implements ``Lane.catch_up``."""
         super().catch_up(deadline)
         if self._asked != BY_SERVER:
             self._drop(self._wait_for_all(deadline))
 
     def _drop(self, deaths: dict[int, WorkerDiedError]) -> None:
-        """Take no answer: where one lies was chosen, but perhaps the request never sent."""
+        """Drop the answers unread: after an interrupt the slabs may hold older ones."""
         if deaths:
             raise RunnersDiedError([None] * len(self.shards), deaths)
 
     # --- waiting -------------------------------------------------------------------------------
 
     def _wait_for_all(self, deadline: Deadline) -> dict[int, WorkerDiedError]:
-        """Until every shard has answered; returns which runners of a kept jail have died before.
+        """Wait until every shard has answered; returns the runners of a kept jail that died before.
 
         Raises:
             WorkerTimeoutError: The deadline came first.
             WorkerDiedError: The jail has ended.
         """
-        # In this order. The sleepers, who share this core, cannot run before we sleep: so we sleep
-        # for them first, at once, while the others compute on their own cores. What these have
-        # taken by then costs nothing more. Only then do we wait awake for the others, within one
-        # budget for all of them, since a sleep and a wake-up cost more than most steps; for who is
-        # later than that we sleep as well. Each wait looks at its shard's answer before it looks at
-        # a death: a runner that answers and then dies has answered. All shards are waited for, also
-        # after one has raised: an answer that is left in its slab would be taken for the answer to
-        # the next request (interruption.md, rule 1). An interrupt anywhere here leaves ``_asked``
-        # as it was, and ``catch_up`` waits for the same answers again: to wait takes nothing away.
-        # What ``answered`` has found is not waited for: a jail may take it back, and others would
-        # wait for it as well.
+        # The order matters:
+        #
+        # 1. We sleep for the sleepers, which share our core and cannot run before we sleep. The
+        #    others compute on their own cores meanwhile.
+        # 2. We wait awake for the others, within one budget for all of them, since a sleep and a
+        #    wake-up cost more than most steps. For a shard that is later than that we sleep.
+        #
+        # Each wait looks at its shard's answer before it looks at a death: a runner that answers
+        # and then dies has answered. All shards are waited for, also after one has raised: an
+        # answer left in its slab would be taken for the answer to the next request
+        # (interruption.md, rule 1). Waiting removes no answer, so after an interrupt ``_asked`` is
+        # unchanged and ``catch_up`` waits for the same answers again. If ``answered`` has found
+        # all answers (``_settled_ns``), there is no wait: a hostile jail could take its answer
+        # back and delay the other workers.
         if self._settled_ns != self._asked_ns and not self._all_answer(deadline):
             return self._deaths(deadline)
         self.elapsed_ns = perf_counter_ns() - self._asked_ns
@@ -342,7 +353,7 @@ class SharedMemoryLane(SlabLane):
         return {}
 
     def _all_answer(self, deadline: Deadline) -> bool:
-        """Wait for every shard; whether they have answered before one of the runners ended."""
+        """Wait for every shard; returns False if a process ended before all had answered."""
         for shard in self._sleepers:
             if not shard.answered_before_death(self._watch, deadline):
                 return False
@@ -357,14 +368,14 @@ class SharedMemoryLane(SlabLane):
         return True
 
     def _deaths(self, deadline: Deadline) -> dict[int, WorkerDiedError]:
-        """A runner has ended, or its jail, or the server; that one knows why, if it lives."""
+        """The deaths after a runner, its jail or the server has ended; the server knows why."""
         if not self.jail.kept:
             raise self.jail.cause_of_death(self._asked)
         answers = self._attachment.answers
         dead = [i for i, shard in enumerate(self.shards) if not answers(i, shard, deadline)]
-        if not dead:  # they had answered before
+        if not dead:  # all had answered before the death
             return {}
-        try:  # how, the server knows at the latest when they have been reaped
+        try:  # the server knows how they died, at the latest when it has reaped them
             self._ask_for(dead)
             Lane.replies(self, Deadline(_CAUSE_S))
         except RunnersDiedError as error:
@@ -374,13 +385,13 @@ class SharedMemoryLane(SlabLane):
     # --- the rest ------------------------------------------------------------------------------
 
     def traffic(self) -> tuple[int, int, int]:
-        """See ``Lane``."""
+        """Implements ``Lane.traffic``."""
         stale, sent, received = super().traffic()
         sent += sum(shard.told_bytes for shard in self.shards)
         return stale, sent, received + sum(shard.answer_bytes for shard in self.shards)
 
     def close(self) -> None:
-        """See ``Lane``."""
+        """Implements ``Lane.close``: closes the slabs, doorbells and slots."""
         for shard in self.shards:
             shard.close()
         self._attachment.close()

@@ -1,9 +1,9 @@
-"""Steps through slabs that the server shares with the runners, for a client that cannot.
+"""The lane of a client that cannot share memory: the server shares slabs with the runners.
 
-It is on another host, or the caller has chosen frames. A step is one message each way: the client's
-half of each shard's request slab, and what the runner wrote into the reply and the observations.
-All else goes as over ``Lane``, and so do steps of which several are on their way: a slab has
-room for one.
+The client is on another host, or the caller has chosen frames. A step is one message each way:
+the client's half of each shard's request slab goes out, the contents of the reply and observation
+slabs come back. All other requests go as over ``Lane``, and so do steps if several are in flight,
+since a slab has room for one step.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ _BYTE, _FLAG, _REWARD = map(np.dtype, (np.uint8, np.bool_, np.float64))
 
 
 class ServedLane(ColumnSteps):
-    """See ``ColumnSteps``.
+    """Steps in columns (``ColumnSteps``) through the server's slabs.
 
     Args:
-        relay: The way over the server, to the same runners.
-        shards: The slabs of each.
+        relay: The lane over the server, to the same runners.
+        shards: The slabs of each shard.
     """
 
     shards: list[ServedShard]
@@ -58,7 +58,7 @@ class ServedLane(ColumnSteps):
 
     @classmethod
     def open(cls, relay: Lane, deadline: Deadline) -> ServedLane | None:
-        """The lane; None where the spaces have no fixed layout, or one side refuses.
+        """Make a lane; None if the spaces have no fixed layout, or the server or a runner refuses.
 
         Raises:
             WorkerError: A runner died, or took too long.
@@ -76,7 +76,7 @@ class ServedLane(ColumnSteps):
         return lane if lane._attach(range(len(shards)), deadline) else None
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
-        """See ``Lane``; they get slabs that the dead never saw."""
+        """Implements ``Lane.renew``; new runners get new slabs, which the dead ones never saw."""
         super().renew(dead, fresh, deadline)
         for index in dead:
             self.shards[index] = ServedShard(self.shards[index].layout, self.shards[index].observed)
@@ -84,8 +84,8 @@ class ServedLane(ColumnSteps):
             raise RemoteProtocolError("a fresh runner refuses the slabs that others take")
 
     def _attach(self, shards: Sequence[int], deadline: Deadline, *, again: bool = False) -> bool:
-        """Have the server make slabs and the runners serve them; whether all of them do.
-        ``again``: others have; a refusal of the server's is raised.
+        """Have the server make slabs and the runners serve them; returns whether all do.
+        ``again``: whether other shards have slabs already, so that a refusal is an error.
         """
         runners, wanted = self.runners, [(index, self.shards[index]) for index in shards]
         sizes = tuple((runners[index], *shard.sizes) for index, shard in wanted)
@@ -93,7 +93,7 @@ class ServedLane(ColumnSteps):
             return False
         request = m.ShareSlabs(self.jail.number, sizes)
         reply, _ = self.jail.client.request(request, deadline=deadline)
-        if isinstance(reply, m.Refusal) and not again:  # its limits, or a quota, are lower
+        if isinstance(reply, m.Refusal) and not again:  # its limits or a quota may be lower
             return False
         expect_reply(reply, m.Done)
         parts = tuple((runner, 1) for runner in runners)
@@ -107,15 +107,15 @@ class ServedLane(ColumnSteps):
 
     @property
     def takes_more(self) -> bool:
-        """See ``Lane``."""
+        """Implements ``Lane.takes_more``: only while steps are messages."""
         return self._by_message and super().takes_more
 
     def expect_more(self) -> None:
-        """See ``Lane``."""
+        """Implements ``Lane.expect_more``: the next step that is sent alone is a message."""
         self._more_wanted = True
 
     def send_step(self, actions: Any, *, ahead: bool = False) -> None:
-        """See ``Lane``."""
+        """Implements ``Lane.send_step``."""
         if not ahead:
             self._by_message, self._more_wanted = self._more_wanted, False
         if self._by_message and super().takes_more:
@@ -134,7 +134,7 @@ class ServedLane(ColumnSteps):
         return not self._owed or self._owed[0][2] is None
 
     def wait(self, deadline: Deadline) -> None:
-        """See ``Lane``."""
+        """Implements ``Lane.wait``."""
         self._by_slabs = not self._by_server
         if self._by_slabs:
             super().wait(deadline)
@@ -142,7 +142,7 @@ class ServedLane(ColumnSteps):
             Lane.wait(self, deadline)
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-        """See ``Lane``. Trust: input from the worker."""
+        """Implements ``Lane.result``. Trust: input from the worker."""
         return super().result(infos) if self._by_slabs else Lane.result(self, infos)
 
     def _outcomes(self, deadline: Deadline) -> tuple[list[Outcome], dict[int, WorkerDiedError]]:
@@ -154,13 +154,13 @@ class ServedLane(ColumnSteps):
             outcomes, deaths = error.replies, error.deaths
         self.elapsed_ns = perf_counter_ns() - self._asked_ns
         if 0 < self._spin.budget_ns < self.elapsed_ns:
-            self._spin.missed()  # the runner has gone to sleep: count a missed spin
+            self._spin.missed()  # the runner has gone to sleep: a missed spin
         self._spin.measured(self.elapsed_ns)
         said = [outcome or NO_MORE for outcome in outcomes]
         return said if deaths or said != [NO_MORE] * len(said) else [], deaths
 
     def _incomplete(self) -> list[int] | None:
-        """Trust: input from the worker."""
+        """Implements ``SlabLane._incomplete``. Trust: input from the worker."""
         if not self.jail.client.arrived(self._owed[0][0]):
             return None
         parts = self.jail.arrived(self._owed[0][0])
@@ -171,14 +171,15 @@ class ServedLane(ColumnSteps):
 
 
 class ServedShard(ShardSlabs):
-    """Our half of the slabs of one shard, and what the server sent of the other.
+    """Our half of one shard's slabs, and the other half as the server sent it.
 
     Args:
-        layout, observed: Where actions and results lie.
+        layout, observed: The layouts of actions and of results.
 
     Attributes:
-        observed: As given; these are its own rows, and no others.
-        sizes: Leaves of the actions, and bytes of the request slab and of the observation slab.
+        observed: As given; it covers the rows of this shard alone.
+        sizes: The number of leaves of the actions, and the bytes of the request slab and of the
+            observation slab.
     """
 
     def __init__(self, layout: slabs.Layout, observed: slabs.ObservationLayout) -> None:
@@ -192,12 +193,12 @@ class ServedShard(ShardSlabs):
         self._written = memoryview(request)[slabs.HEADER_BYTES : layout.message]
 
     def ask(self, leaves: Sequence[Any], spin_ns: int) -> bytes:
-        """What the server writes into the request slab for a step."""
+        """The bytes that the server writes into the request slab for a step."""
         self.write(leaves, (0, spin_ns, 0))
         return b"".join((self._words, self._written))
 
     def read(self, frames: Frames) -> Outcome:
-        """How a step went, and what is in the slabs. Trust: input from the worker."""
+        """Read the outcome of a step, and keep its results. Trust: input from the worker."""
         first = memoryview(frames[0])
         if len(first) < _HEAD.size:
             raise RemoteProtocolError("the worker sent less than the outcome of a step")
@@ -215,19 +216,19 @@ class ServedShard(ShardSlabs):
         return self.outcome()
 
     def leaves(self) -> list[Any]:
-        """Its observations."""
+        """The observations of this shard, by leaves."""
         return [self._array(leaf.dtype, leaf.shape, leaf.offset) for leaf in self.observed.leaves]
 
     def results(self) -> tuple[Any, Any, Any]:
-        """Its rewards, terminations and truncations; what was received is gone then."""
+        """The rewards, terminations and truncations of this shard; drops the received frames."""
         start, count = self.observed.results, self.layout.count
         rewards = self._array(_REWARD, (count,), start)
         flags = self._array(_FLAG, (2 * count,), start + rewards.nbytes)
-        self._received = ()  # what a large batch took is memory for the next
+        self._received = ()  # so that the next large batch can use the memory
         return rewards, flags[:count], flags[count:]
 
     def _array(self, dtype: np.dtype[Any], shape: tuple[int, ...], start: int) -> Any:
-        # cast, not viewed: a hostile byte of 2 would make a bool that is neither
+        # cast, not viewed as bool: a hostile byte of 2 would be neither True nor False
         raw = _BYTE if dtype is _FLAG else dtype
         if len(self._received) == 1:
             return np.ndarray(shape, raw, self._received[0], start).astype(dtype)
@@ -237,8 +238,8 @@ class ServedShard(ShardSlabs):
 
 
 class ReceivedBatch:
-    """The results of all shards, out of frames: the caller's own.
-    ``space``: the single observation space; ``shards``: what was received of each.
+    """Joins the results of all shards from frames into arrays that the caller owns.
+    ``space``: the single observation space; ``shards``: the slabs of each shard.
     """
 
     def __init__(self, space: gym.Space[Any], shards: Sequence[ServedShard]) -> None:
@@ -251,7 +252,7 @@ class ReceivedBatch:
         return self._assemble(list(map(_joined, leaves)))
 
     def results(self) -> tuple[Any, Any, Any]:
-        """Rewards (float64), terminations and truncations (bool), ``(num_envs,)``; once a step."""
+        """Rewards (float64), terminations, truncations (bool), ``(num_envs,)``. Once a step."""
         columns = zip(*(shard.results() for shard in self._shards), strict=True)
         rewards, over, cut = map(_joined, columns)
         return rewards, over, cut
@@ -262,7 +263,7 @@ def _joined(parts: Sequence[Any]) -> Any:
 
 
 def _copy(pieces: Sequence[Buffer], start: int, into: memoryview) -> None:
-    """A range of what lies in several pieces."""
+    """Copy a range of bytes that may span several pieces."""
     at, stop = 0, start + len(into)
     for piece in pieces:
         begin, end = max(start, at), min(stop, at + len(piece))

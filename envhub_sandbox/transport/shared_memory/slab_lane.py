@@ -1,7 +1,7 @@
-"""Answers that lie in slabs, whoever holds the other end for us: a runner, or the server.
+"""The common part of lanes with slabs, whose other end is at a runner or at the server.
 
-What did not fit there is fetched over the server (``SlabLane``). Steps in columns are those of
-plain sub-environments with spaces of a fixed layout (``ColumnSteps``).
+``SlabLane`` fetches answers that did not fit the slabs over the server. ``ColumnSteps`` steps in
+columns, for plain sub-environments with spaces of a fixed layout.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ STEP = "step"
 
 
 class SlabLane(Lane):
-    """A lane that fetches what did not fit the slabs: see ``Lane``.
-    ``shards``: the slabs of each.
+    """A lane that fetches answers that did not fit the slabs over the server: see ``Lane``.
+    ``shards``: the slabs of each shard.
     """
 
     shards: Sequence[ShardSlabs]
@@ -43,24 +43,24 @@ class SlabLane(Lane):
     def __init__(self, relay: Lane) -> None:
         super().__init__(relay.jail, relay.runners, relay.number, relay.declared)
         self._asked = STEP
-        self._fetching: tuple[int, Sequence[int]] = 0, ()  # for which request, of which shards
-        self._settled_ns = 0  # the request of which ``answered`` has found all answers
+        self._fetching: tuple[int, Sequence[int]] = 0, ()  # request's time, shards
+        self._settled_ns = 0  # time of the request whose answers ``answered`` has all found
 
     @property
     @abstractmethod
     def _by_server(self) -> bool:
-        """Whether the answer that is owed is one of messages over the server."""
+        """Whether the answer that is owed comes as messages over the server."""
 
     @abstractmethod
     def _incomplete(self) -> list[int] | None:
-        """The shards whose answers are there, and did not fit; None if one is not there."""
+        """The shards whose answers did not fit; None if a shard has not answered yet."""
 
     def _has_ended(self) -> bool:
-        """Whether there is nothing to wait for although a shard has not answered."""
+        """Whether a process has ended, so that there is nothing to wait for."""
         return False
 
     def answered(self) -> bool:
-        """See ``Lane``. What has to be fetched is asked for here: a runner may never give it."""
+        """Implements ``Lane.answered``; also asks for infos that did not fit, without waiting."""
         if self._by_server:
             return super().answered()
         if self._settled_ns == self._asked_ns:
@@ -72,7 +72,7 @@ class SlabLane(Lane):
             try:
                 if missing:
                     self._ask_for(missing, ahead=True)
-            except EnvHubError:  # whoever waits asks again, and meets the same
+            except EnvHubError:  # ``wait`` asks again, and raises it
                 return True
             self._fetching = self._asked_ns, missing
         if self._fetching[1] and not self.jail.client.arrived(self._owed[-1][0]):
@@ -88,10 +88,10 @@ class SlabLane(Lane):
     def _fetched(
         self, missing: Sequence[int], deaths: dict[int, WorkerDiedError], deadline: Deadline
     ) -> dict[int, m.Message | None]:
-        """What did not fit, by shards. Who dies meanwhile is added to the deaths.
+        """Fetch the answers of the ``missing`` shards; adds new deaths to ``deaths``.
 
-        Trust: input from the worker. An answer that says after ``answered`` that more has to be
-        fetched is refused: that may never come, and others wait meanwhile.
+        Trust: input from the worker. After ``answered``, a jail may not change its answer to one
+        that has to be fetched: that might never come, and other workers would wait.
         """
         asked = missing
         if self._fetching[0] == self._asked_ns:
@@ -112,19 +112,19 @@ class SlabLane(Lane):
         return {i: reply for i, reply in zip(asked, replies, strict=True) if i in missing}
 
     def catch_up(self, deadline: Deadline) -> None:
-        """See ``Lane``."""
+        """Implements ``Lane.catch_up``."""
         super().catch_up(deadline)
-        # with what ``answered`` has asked for besides: it is asked for anew
+        # this has dropped the fetches of ``answered``, too, which are repeated if needed
         self._settled_ns, self._fetching = 0, (0, ())
 
 
 class ColumnSteps(SlabLane):
-    """Steps whose actions and results have a layout: see ``Lane``.
+    """Steps whose actions and results are columns with a fixed layout: see ``Lane``.
 
     Args:
-        layout: Where a shard's actions lie.
-        batch: Where all shards have their results.
-        rest: As the next class in line has it.
+        layout: The layout of a shard's actions.
+        batch: The results of all shards.
+        rest: Further arguments of the next class in the method resolution order.
     """
 
     def __init__(
@@ -140,23 +140,23 @@ class ColumnSteps(SlabLane):
 
     @abstractmethod
     def _outcomes(self, deadline: Deadline) -> tuple[list[Outcome], dict[int, WorkerDiedError]]:
-        """Every shard's outcome, once it has answered, and who has died before; nothing at all if
-        none says more than its results. Raises as ``Lane.wait``.
+        """Wait; returns every shard's outcome, and the deaths. The outcomes are empty if all
+        shards have results only. Raises as ``Lane.wait``.
         """
 
     def _rows(self, actions: Any) -> Iterable[list[Any]]:
-        """Each shard's actions, by leaves."""
+        """The leaves of the actions, for each shard its slice."""
         leaves = [actions] if self._flat_actions else slabs.flatten(self._action_space, actions)
         if len(self._bounds) == 1:
             return [leaves]
         return ([leaf[start:stop] for leaf in leaves] for start, stop in self._bounds)
 
     def wait(self, deadline: Deadline) -> None:
-        """See ``Lane``."""
+        """Implements ``Lane.wait``."""
         self._said, deaths = self._outcomes(deadline)
         kinds = [kind for kind, _ in self._said]
-        # what one has raised comes before the infos of others, unless a recovery needs these, or
-        # they were asked for: warnings come with them
+        # If a shard raised, the infos of others are not fetched, unless a recovery needs them, or
+        # they were requested already: warnings come with them.
         if deaths or self._owed or (slabs.FETCH in kinds and slabs.RAISED not in kinds):
             missing = [index for index, kind in enumerate(kinds) if kind == slabs.FETCH]
             for index, reply in self._fetched(missing, deaths, deadline).items():
@@ -165,7 +165,7 @@ class ColumnSteps(SlabLane):
             raise RunnersDiedError(self._stepped(deaths), deaths)
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-        """See ``Lane``. Trust: input from the worker."""
+        """Implements ``Lane.result``. Trust: input from the worker."""
         if infos is None:
             infos = self._infos() if self._said else {}
         return (self._batch.take(), *self._batch.results(), infos)
@@ -182,7 +182,7 @@ class ColumnSteps(SlabLane):
         return self.declared.infos(parts)
 
     def _stepped(self, deaths: Collection[int]) -> list[m.Message | None]:
-        """What the living wrote, as messages. Trust: input from the worker."""
+        """The results of the living shards, as messages. Trust: input from the worker."""
         with UNTRUSTED:
             parts, flags = self._observations(), self._batch.results()
             return [
@@ -199,6 +199,6 @@ class ColumnSteps(SlabLane):
         return m.StepDone(observation, rewards, over, cut, info)
 
     def _observations(self) -> list[Any]:
-        """The rows of each shard."""
+        """The observations, for each shard its rows."""
         space = self.declared.manifest.single_observation_space
         return list(batches.split(space, self._batch.take(), self._bounds))
