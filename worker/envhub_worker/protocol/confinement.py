@@ -1,5 +1,5 @@
-"""What a jail is permitted, as it travels from the client's ``Policy`` to the lockdown, how it may
-end, and what a container says that holds around its server.
+"""The permissions of a jail, which travel from the client's ``Policy`` to the lockdown; the ways a
+jail may end; and the confinement that a container announces around its server.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Confinement:
         gpu: Grants the device nodes of all GPUs, or of those with these indices.
         environment: Environment variables that the caller grants by name, with their values.
         limits: Hard caps.
-        record_denials: Init itself answers the system calls that are denied, and tells which.
+        record_denials: Init answers denied system calls itself and reports each.
         display: ``"none"``, or ``"virtual"`` for an Xvfb of its own.
     """
 
@@ -102,20 +102,20 @@ _MAX_NAME = 64
 
 @dataclass(frozen=True, kw_only=True)
 class Surroundings:
-    """What holds around a process.
+    """The confinement that a container already puts around a process.
 
     Attributes:
-        profiles: Those of a jail that can be had in there, the strongest first.
-        landlock: Its ABI, or 0.
-        user: The process's id.
-        capabilities: What some set holds, as a number.
-        no_new_privileges: Whether it can gain none.
-        seccomp: Whether a filter is there.
-        read_only: Whether the root is.
+        profiles: Profiles that a jail in the container can have, the strongest first.
+        landlock: The kernel's Landlock ABI, or 0.
+        user: The user id of the process.
+        capabilities: Union of the process's capability sets, as a bit mask.
+        no_new_privileges: Whether the process has ``no_new_privs``.
+        seccomp: Whether a seccomp filter is installed.
+        read_only: Whether the root file system is read-only.
         devices: Names of network devices.
-        memory: Its limit in bytes, or None.
-        pids: The limit of processes and threads, or None.
-        cpus: The limit in processors' worth of time, or None.
+        memory: Memory limit in bytes, or None.
+        pids: Limit of processes and threads, or None.
+        cpus: CPU limit in processors, or None.
         python: The interpreter for jails; empty for the server's own.
     """
 
@@ -134,7 +134,7 @@ class Surroundings:
 
     @classmethod
     def read(cls, document: Mapping[str, Any]) -> Surroundings:
-        """What was announced, each field as its type. Raises whatever the values lead to.
+        """Reads an announcement and converts each field to its type. Raises whatever that raises.
 
         Unknown profiles are left out. Trust: input from the worker.
         """
@@ -146,7 +146,7 @@ class Surroundings:
 
 
 def _read(kind: str, value: Any) -> Any:
-    """A value as the annotation of its field says."""
+    """Converts a value to the type that its field is annotated with."""
     if kind == "bool":
         return value is True
     if kind == "tuple[str, ...]":

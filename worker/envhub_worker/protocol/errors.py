@@ -1,12 +1,12 @@
 """Errors of the wire. ``envhub_sandbox.errors`` prints the whole tree.
 
-``UNTRUSTED`` is the context in which whatever a peer's input raises is the peer's error. Readers
-check for known lies, and say what is wrong. An unknown one, such as a key that cannot be hashed or
-a mask that is longer than its values, comes up as a ``TypeError`` or an ``IndexError`` from
-somewhere below. ``UNTRUSTED`` stands around each place where input is handled, and makes
-``RemoteProtocolError`` of it, with the place in ``__cause__``.
+In the context ``UNTRUSTED`` every error that a peer's input raises is the peer's error. Readers
+check for known lies and name them. An unforeseen lie, such as an unhashable key or a mask longer
+than its values, raises a ``TypeError`` or an ``IndexError`` somewhere below. Each reader of input
+runs in ``UNTRUSTED``, which raises ``RemoteProtocolError`` from that error, so ``__cause__`` shows
+the line.
 
-It must not stand around a wait: what a signal handler of the caller's raises there is his.
+Do not wait inside this context: an error that the caller's signal handler raises is not the peer's.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ class EnvHubError(Exception):
     """Base of every error of this project.
 
     Attributes:
-        denied: What the jail was denied that it ends, in the words of
-            ``env.sandbox.denials()``; None where it is not recorded, or no jail has ended.
-        env_ids: Of ``send`` and ``recv``: the sub-environments of the worker that it is about.
+        denied: Denials before the jail ended, as ``env.sandbox.denials()`` words them; None if
+            denials are not recorded or no jail has ended.
+        env_ids: For ``send`` and ``recv``: the sub-environments of the worker that failed.
     """
 
     denied: tuple[str, ...] | None = None
@@ -69,11 +69,11 @@ _MAX_CHARS = 500
 
 
 class UntrustedInput:
-    """A context in which a peer's input is handled; keeps nothing, so one serves all.
+    """The context in which a peer's input is handled. It has no state: one instance serves all.
 
     Raises:
-        MessageTooLargeError: There was not enough memory for it.
-        RemoteProtocolError: Anything of ``FAULTS`` came up. Errors of this project pass.
+        MessageTooLargeError: There was not enough memory for the input.
+        RemoteProtocolError: The block raised one of ``FAULTS``. This project's errors pass.
     """
 
     __slots__ = ()
@@ -95,12 +95,12 @@ UNTRUSTED = UntrustedInput()
 
 
 def is_fault(error: BaseException) -> bool:
-    """Whether that is what handling a peer's input may raise, and no error of this project yet."""
+    """Whether ``error`` is one that a peer's input may cause and that has no class of ours yet."""
     return isinstance(error, FAULTS) and not isinstance(error, EnvHubError)
 
 
 def blamed(error: BaseException) -> RemoteProtocolError:
-    """The error to raise for it. Trust: its text may hold the peer's own."""
+    """Returns the error to raise instead. Trust: its text may quote the peer."""
     if isinstance(error, MemoryError):
         return MessageTooLargeError("there is not enough memory for the peer's message")
     # it brings inspect, and a server starts its zygote before that

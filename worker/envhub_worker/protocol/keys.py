@@ -12,10 +12,10 @@ _Z85_CHARS = 40
 
 
 def parse_key(text: str) -> bytes:
-    """The 32 bytes of a key.
+    """Returns the 32 bytes of a key.
 
     Raises:
-        ValueError: It is no key; the text is not repeated, for it may be secret.
+        ValueError: The text is no key. The error does not repeat it, for it may be secret.
     """
     text = text.strip()
     try:
@@ -31,7 +31,7 @@ def parse_key(text: str) -> bytes:
 
 
 def key_text(key: bytes) -> str:
-    """A key as we print it."""
+    """Returns a key in hexadecimal, as all output of this project shows it."""
     return key.hex()
 
 

@@ -78,8 +78,8 @@ class Lifecycle:
     """A state and its legal moves.
 
     Attributes:
-        request: What was asked and is not answered yet. None in ``LATE``: how far it came is
-            not known.
+        request: The request that has no answer yet. None in ``LATE``, where nobody knows how far
+            the worker came with it.
     """
 
     request: str | None = None
@@ -99,12 +99,12 @@ class Lifecycle:
             self.on(Event.REPLY)
 
     def moved(self, event: Event) -> None:
-        """``on``, unless it was closed meanwhile: by another thread, or a signal handler."""
+        """Like ``on``, but does nothing if another thread or a signal handler has closed it."""
         if self.state is not State.CLOSED:
             self.on(event)
 
     def on(self, event: Event) -> State:
-        """Move.
+        """Moves to the state that the table has for ``event``.
 
         Raises:
             RuntimeError: The move is illegal; that is a defect of this package.

@@ -48,7 +48,7 @@ DEFAULT_LIMITS = WireLimits()
 
 @lru_cache(maxsize=256)  # a client on another host chooses them
 def limits_for(message_bytes: int) -> WireLimits:
-    """The limits of one jail. Equal ones are one object: kept forms of messages belong to it."""
+    """The limits of one jail. Equal limits are the same object, which ``Forms`` compares."""
     return WireLimits(frame_bytes=message_bytes, message_bytes=message_bytes)
 
 

@@ -20,7 +20,7 @@ else:
     def dataclass(
         *, frozen: bool, kw_only: bool = False, repr: bool = True
     ) -> Callable[[type], type]:
-        """As the standard library's, for frozen classes."""
+        """Like ``dataclasses.dataclass(frozen=True)``; see the module."""
         assert frozen
         return lambda cls: _recorded(cls, kw_only=kw_only, shown=repr)
 
@@ -44,7 +44,7 @@ class About(NamedTuple):
 
 
 class _Signature:
-    """What ``inspect`` and notebooks show of a class, made when it is asked for."""
+    """The signature that ``inspect`` and notebooks show, made on first access."""
 
     def __get__(self, record: object, cls: Any) -> inspect.Signature:
         from inspect import Parameter, Signature
@@ -64,7 +64,7 @@ class _Signature:
 
 
 class FrozenRecord:
-    """The methods that records share, and messages with them."""
+    """The methods that all records and messages share."""
 
     __record__: ClassVar[About]
     __order__: ClassVar[tuple[str, ...] | None]
@@ -131,7 +131,7 @@ def _default(field: dataclasses.Field[Any]) -> Callable[[], Any] | None:
 
 
 def _completed(record: Any, values: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
-    """All fields in order, from positional arguments, keyword arguments and defaults."""
+    """Returns all fields in order, from positional arguments, keyword arguments and defaults."""
     about: About = record.__record__
     names, defaults = about.names, about.defaults
     given_values = dict(zip(about.positional, values)) | named  # noqa: B905 - seen below

@@ -1,6 +1,5 @@
-"""What runs a repository: an interpreter of this machine, and the packages that it gets.
-
-And what it finds in its cache of the Hub: see ``HubCopy``.
+"""What a repository runs with: an interpreter of this machine, a folder of packages, and the
+contents of its Hub cache (``HubCopy``).
 """
 
 from __future__ import annotations
@@ -31,14 +30,15 @@ _TABLES = (
 class Runtime(NamedTuple):
     """An interpreter and a folder of packages.
 
-    No dataclass, for a server needs one before it starts its zygote: these import ``inspect``.
+    No dataclass: a server needs it before it starts its zygote, and ``dataclasses`` imports
+    ``inspect``.
 
     Attributes:
         python: Absolute path of the interpreter. It belongs to the machine and is trusted; empty
             for the worker server's own.
-        packages: Absolute path of a folder as ``uv pip install --target`` makes it, whose code is
-            as little trusted as the repository's: nothing of it runs outside of a jail. Empty for
-            the packages that the interpreter itself has, which are trusted as it is.
+        packages: Absolute path of a folder as ``uv pip install --target`` makes it. Its code is
+            as untrusted as the repository's and runs only in jails. Empty for the interpreter's
+            own packages, which are trusted.
     """
 
     python: str
@@ -54,7 +54,7 @@ OWN = Runtime("")
 
 
 def site_options() -> list[str]:
-    """What tells ``bootstrap.py`` where ``pip install --user`` has put packages of this process."""
+    """Returns the options that tell ``bootstrap.py`` where ``pip install --user`` puts packages."""
     import site
 
     folder = site.getusersitepackages()
@@ -62,9 +62,10 @@ def site_options() -> list[str]:
 
 
 def mapped_modules(finders: Iterable[object]) -> dict[str, tuple[str, ...]]:
-    """Where finders (``sys.meta_path``) have modules, by full name: read as data, none is asked.
+    """Returns the paths of editable modules by full name, read from finders (``sys.meta_path``).
 
-    A path may lack its suffix, as setuptools writes that of a single file.
+    The finders' tables are read as data; no finder runs. A path may lack its suffix: setuptools
+    writes that of a single-file module without.
     """
     folders: dict[str, tuple[str, ...]] = {}
     for table in _tables(finders):
@@ -88,10 +89,10 @@ class HubCopy(NamedTuple):
     """One repository of a jail's own cache of the Hub, at one commit.
 
     Attributes:
-        folder: What the cache of the Hub calls it: ``"models--org--name"``.
+        folder: The repository's folder name in the Hub cache: ``"models--org--name"``.
         commit: The full commit.
-        revisions: Branches and tags that mean this commit.
-        tree: The folder with its files; empty for those of the jail's own snapshot.
+        revisions: Branches and tags that point to this commit.
+        tree: The folder with its files; empty if they are those of the jail's own snapshot.
     """
 
     folder: str
@@ -101,17 +102,19 @@ class HubCopy(NamedTuple):
 
 
 def is_cached_revision(text: str) -> bool:
-    """Whether ``HubCopy.revisions`` may have it. Each is a path in the cache; git permits more."""
+    """Whether ``HubCopy.revisions`` may hold a name. It becomes a path in the cache, so fewer names
+    are allowed than in git.
+    """
     return re.fullmatch(_REVISION, text) is not None
 
 
 def read_hub_copies(value: Any) -> tuple[HubCopy, ...]:
-    """Read what ``OpenJail`` holds; lists for tuples permitted.
+    """Reads the Hub copies of an ``OpenJail``; lists may stand for tuples.
 
-    Trust: a client on another host may have written it.
+    Trust: a client on another host may have written them.
 
     Raises:
-        RemoteProtocolError: A name or number that there cannot be.
+        RemoteProtocolError: A name or a number is invalid.
     """
     if type(value) not in (list, tuple) or len(value) > MAX_HUB_COPIES:
         raise _wrong()

@@ -1,9 +1,9 @@
 """Environment variables that are read once, when a process or a library of it starts.
 
-The processes of a jail are forked from a zygote, which has started already: set in a jail, most of
-these would do nothing. So a zygote is started with them, one for each set of values. It is not
-confined then, and a server's client is a stranger: names and values are those that make it open,
-load and import nothing. All others of the kind are refused.
+The processes of a jail are forked from a zygote, which has started already, so most of these
+variables would have no effect in a jail. The server therefore starts a zygote with them, one for
+each set of values. That process is not confined yet and the client is a stranger: only names and
+values that make a zygote open, load and import nothing are allowed; the others are refused.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _REFUSED = re.compile(
 
 
 def _values_of(name: str) -> re.Pattern[str] | None:
-    """The values with which a zygote may be started; None if the variable is not such a one."""
+    """Returns the allowed values of a variable that is read at start; None for other variables."""
     return next((values for names, values in _VALUES.items() if names.fullmatch(name)), None)
 
 
@@ -80,7 +80,7 @@ def at_start(environment: Mapping[str, str]) -> dict[str, str]:
 
 
 def fixed_hash_seed(environment: Mapping[str, str]) -> dict[str, str]:
-    """The seed that a caller's own interpreter has, where that is a number."""
+    """Returns ``PYTHONHASHSEED`` of an environment if it is a number, else nothing."""
     seed = environment.get(HASH_SEED, "")
     fixed = seed.isascii() and seed.isdecimal() and int(seed) <= _MAX_HASH_SEED
     return {HASH_SEED: str(int(seed))} if fixed else {}

@@ -39,7 +39,7 @@ def pack_packet(request_id: int, frames: Sequence[Buffer]) -> list[Buffer]:
 def _whole(
     data: memoryview, limits: WireLimits, check: Callable[[int], None] | None
 ) -> tuple[int, Packet | None]:
-    """The size of the first packet and the packet, without a copy; ``(0, None)`` if incomplete."""
+    """Returns the first packet's size and the packet, not copied; ``(0, None)`` if incomplete."""
     end = _head_bytes(data, limits)
     if data.nbytes < end:
         return 0, None
@@ -61,7 +61,7 @@ def _cut(body: memoryview, lengths: tuple[int, ...]) -> list[Buffer]:
 
 
 def _head_bytes(data: memoryview | bytearray, limits: WireLimits) -> int:
-    """The length of the head at the start of the data, or of its prefix if that is incomplete."""
+    """Returns the length of the head; of its fixed part while the number of frames is missing."""
     if len(data) < _PREFIX.size:
         return _PREFIX.size
     count, request_id = _PREFIX.unpack_from(data)
@@ -73,7 +73,7 @@ def _head_bytes(data: memoryview | bytearray, limits: WireLimits) -> int:
 def _read_head(
     data: memoryview | bytearray, size: int, limits: WireLimits, check: Callable[[int], None] | None
 ) -> tuple[int, tuple[int, ...]]:
-    """A whole head's request id, and the lengths of its frames."""
+    """Returns the request id and the frames' lengths of a complete head."""
     request_id = _PREFIX.unpack_from(data)[1]
     if check is not None:
         check(request_id)
@@ -110,7 +110,7 @@ class StreamReader:
 
     Args:
         limits: Bounds on a packet.
-        check: Refuses the id of one that must not come, before anything is allocated for it.
+        check: Refuses the id of an unexpected packet before anything is allocated for it.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class StreamReader:
 
     @property
     def chunk(self) -> int:
-        """How many bytes to ask for next: few at first, as most packets are small."""
+        """Returns how many bytes to read next: few at first, for most packets are small."""
         missing = 0 if self._body is None else self._body.nbytes - self._filled
         return min(max(missing, _SMALL_CHUNK), _LARGE_CHUNK)
 
@@ -151,7 +151,8 @@ class StreamReader:
         return self._body is not None and self._filled == self._body.nbytes
 
     def _fill_head(self, data: memoryview) -> memoryview:
-        # not a byte of what follows: a chunk of many small packets would be copied for each
+        # Take the bytes of this head only: a copy of all the rest for each of many small packets
+        # in one chunk would take quadratic time.
         taken = data[: _head_bytes(self._pending, self._limits) - len(self._pending)]
         self._pending += taken
         if len(self._pending) == _head_bytes(self._pending, self._limits):

@@ -1,4 +1,4 @@
-"""Texts for people: a jail's, made fit for a terminal, sizes, times, and what a host lacks."""
+"""Texts for people: a jail's output made safe for a terminal, sizes, times, a host's shortages."""
 
 from __future__ import annotations
 
@@ -77,10 +77,10 @@ def parse_size(text: str, unit: str = "") -> int:
 
     Args:
         text: A number with or without a unit.
-        unit: Of a bare number: ``""`` for bytes, ``"m"``, ``"g"``.
+        unit: The unit of a bare number: ``""`` for bytes, ``"m"``, ``"g"``.
 
     Raises:
-        ValueError: It is no size, or lacks a unit; the text says what is one.
+        ValueError: The text is no size or lacks a unit; the error gives an example.
     """
     match = re.fullmatch(_SIZE, text.strip().lower())
     if match is None:
@@ -95,15 +95,15 @@ def parse_size(text: str, unit: str = "") -> int:
 
 
 def continued(text: str) -> str:
-    """A stranger's text behind words of ours: lines that follow the first have a margin.
+    """Returns a stranger's text to put after our own on a line: its later lines get a margin.
 
-    Else they could be taken for ours: for the rest of an error, a line of a log, a traceback.
+    Without a margin they could pass for our own: the rest of an error, a log line, a traceback.
     """
     return text.replace("\n", f"\n{MARGIN}")
 
 
 def quoted(text: str) -> str:
-    """The same below words of ours: every line has the margin."""
+    """Returns a stranger's text to put below our own: every line gets the margin."""
     return MARGIN + continued(text)
 
 
@@ -125,7 +125,7 @@ _CURES = {
 
 
 def shortage(error: BaseException, where: str) -> str:
-    """What is used up, where, and what to do; empty for an error of another kind.
+    """Says which resource is used up, where, and what to do; empty for an error of another kind.
 
     Args:
         error: An OSError, or ZeroMQ's error of the same form.

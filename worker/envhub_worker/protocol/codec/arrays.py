@@ -93,8 +93,8 @@ class ArrayReader:
     """Hands out one message's arrays in the order of their descriptors, as copies.
 
     Trust: input from the worker. ``tail`` has the bytes of small arrays, ``frames`` those of large
-    ones, one each. If it ``borrows``, large arrays of numbers lie where their frames do, and the
-    worker may still write them.
+    arrays, one frame each. A reader that ``borrows`` returns large arrays of numbers as views of
+    their frames, which the worker may still write.
     """
 
     __slots__ = ("_borrows", "_frames", "_limits", "_next_byte", "_next_frame", "_tail")
@@ -116,7 +116,7 @@ class ArrayReader:
     def read(
         self, dtype: np.dtype[Any], shape: tuple[int, ...], nbytes: int, own_frame: bool
     ) -> Array:
-        """As ``take``, for a descriptor that ``parse_descriptor`` has split."""
+        """Like ``take``, for a descriptor that ``parse_descriptor`` has already split."""
         if not nbytes:
             return np.empty(shape, dtype)
         array: Array
@@ -331,7 +331,7 @@ def _write_array(encoder: Encoder, array: Array) -> object:
 
 
 def _write_scalar(encoder: Encoder, scalar: np.generic) -> object:
-    """Dtype code, parameter, value; a structured one is a tuple."""
+    """Encodes a numpy scalar as dtype code, parameter and value; a structured value is a tuple."""
     if isinstance(scalar, np.void) and encoder.pickler is None:
         plain = scalar.item()
         return plain if type(plain) is bytes else encoder.default(plain)
@@ -357,7 +357,7 @@ def _write_tensor(encoder: Encoder, tensor: Any) -> object:
 
 
 def tensor_bits(tensor: Any) -> tuple[str, Array | None]:
-    """Torch's name of a tensor's dtype, and its bits; None where it has no form."""
+    """Torch's name of a tensor's dtype, and an array of its bits; None if the wire has no form."""
     name, strided = _tensor_form(tensor.dtype, tensor.layout)
     if not strided or name not in wire.TENSOR_DTYPES:
         return name, None
@@ -377,7 +377,7 @@ def _tensor_form(dtype: Any, layout: Any) -> tuple[str, bool]:
 
 
 def write_numpy(encoder: Encoder, value: Any) -> object:
-    """The form of a subclass, or of another library's array; NotImplemented of all else."""
+    """The wire's form of an array subclass or another library's array, else NotImplemented."""
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(value, getattr(torch, "Tensor", ())):
         return _write_tensor(encoder, value)
@@ -407,7 +407,7 @@ WRITERS: dict[type, Callable[[Encoder, Any], object]] = {
 
 
 def read_numpy_scalar(data: bytes) -> np.generic:
-    """A numpy scalar. Trust: input from the worker. Raises ``RemoteProtocolError``: it is none."""
+    """Decodes a numpy scalar. Trust: input from the worker. Raises ``RemoteProtocolError``."""
     if not data:
         raise RemoteProtocolError("A numpy scalar is empty.")
     dtype, offset = read_dtype(data[0], data, 1)
@@ -450,14 +450,14 @@ def _build_tensor(payload: bytes, items: list[Any], tensors: Tensors) -> object:
 
 
 def tensor(array: Array, name: str, tensors: Tensors) -> object:
-    """The tensor of such bits; without a maker of tensors, an array."""
+    """Makes a tensor of the array of its bits; without a maker of tensors returns an array."""
     if tensors is not None:
         return tensors(array, name)
     return widened_numpy(array) if name == "bfloat16" else array
 
 
 def widened_numpy(bits: Array) -> Array:
-    """The float32 of bfloat16 bits."""
+    """Converts bfloat16 bits (uint16) to float32."""
     wide: Array = (bits.astype(np.uint32) << np.uint32(16)).view(np.float32)
     return wide
 

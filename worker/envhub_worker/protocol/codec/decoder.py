@@ -39,7 +39,7 @@ _LOSSY = _DESCRIBED | {tuple, frozenset, slice}
 
 
 class _Head:
-    """What stands first in a msgpack array and says what the array makes."""
+    """The first element of a msgpack array: it says what value the other elements make."""
 
     __slots__ = ("code", "payload")
 
@@ -59,11 +59,12 @@ class Decoder:
         unpickler: Decodes pickled objects; only a worker, which trusts its client, has one.
         tensors: Makes a tensor of an array and a dtype name (``"bfloat16"`` comes as uint16
             bits). Without it tensors come as arrays, bfloat16 as float32.
-        things: Begins to make what is described. Decoders without it refuse descriptions.
-        borrows: As ``ArrayReader`` has it. What is described is made of copies all the same.
+        things: Makes described objects (spaces, specs, generators). Decoders without it refuse
+            descriptions.
+        borrows: As for ``ArrayReader``. Described objects are made of copies all the same.
 
     Attributes:
-        notes: Where each array and its descriptor are noted; None where nobody asks.
+        notes: A list that each array and its descriptor are added to, or None.
     """
 
     __slots__ = (
@@ -155,7 +156,7 @@ class Decoder:
         return result
 
     def take(self, descriptor: bytes) -> Array:
-        """The next array."""
+        """Returns the next array."""
         if self._arrays is None:
             from envhub_worker.protocol.codec.arrays import ArrayReader
 
@@ -167,7 +168,7 @@ class Decoder:
         return array
 
     def make(self, head: _Head, items: list[Any]) -> object:
-        """What is described; all of one message share a budget."""
+        """Makes a described object. All descriptions of one message share a budget."""
         if self.things is None or len(items) != 1:
             raise RemoteProtocolError("The message describes what is not made here.")
         if self._make is None:
@@ -182,7 +183,7 @@ class Decoder:
             raise MessageTooLargeError(
                 f"More than {self.limits.hashed_keys} keys that are no text (hashed_keys)."
             )
-        # a description's hash is that of its texts, and equal ones cost nothing
+        # A description hashes its texts, which Python randomises; equal descriptions cost nothing.
         chosen = [hash(key) for key in hashed if key.__class__ not in _DESCRIBED]
         same = Counter(chosen).most_common(1)
         if same and same[0][1] > _MAX_SAME_HASH:
@@ -199,7 +200,7 @@ def _owned(value: Any) -> Any:
 
 
 def _distinct(keys: list[Any]) -> list[Any]:
-    """The keys, with a numbered ``RemoteObject`` for each that is unhashable or a duplicate here.
+    """Returns the keys; a numbered ``RemoteObject`` replaces each unhashable or duplicate key.
 
     In the worker they were different objects: two with the same ``repr``, or a tensor.
     """

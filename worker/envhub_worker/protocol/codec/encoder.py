@@ -132,7 +132,7 @@ def _numpy_writer() -> Callable[[Encoder, Any], object]:
 
 
 def _headed(code: int, *names: str) -> Callable[[Encoder, Any], object]:
-    """Writes a list of the type code and the named attributes, or the elements if none is named."""
+    """Writes a list: the type code, then the named attributes, or the elements without names."""
     head = _HEADS[code]
     parts = attrgetter(*names) if names else iter
 
@@ -185,7 +185,7 @@ def encode(
         pickler: Encodes objects that have no form of their own instead. Client to worker only.
         limits: What the receiver accepts.
         names: What to call the elements of the value in an error.
-        describer: Describes what the receiver can make again. Worker to client only.
+        describer: Describes objects that the receiver rebuilds. Worker to client only.
         reduces: Whether a ``RemoteObject`` may stand in the place of a part that cannot be sent.
 
     Returns:
@@ -205,7 +205,7 @@ def encode(
 
     try:
         frames = send(value)
-    # Objects' own code runs here (__array__, iteration): anything can come out of it.
+    # The object's own code runs here (__array__, iteration) and can raise anything.
     except Exception as error:
         from envhub_worker.protocol.codec.unsendable import explain, reduced
 

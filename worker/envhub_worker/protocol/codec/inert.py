@@ -31,7 +31,7 @@ class RemoteObject:
         return f"<remote {self.type_name}: {self.text}>"
 
     def __getattr__(self, name: str) -> NoReturn:
-        # While it is copied or unpickled it has no fields yet.
+        # While copy or pickle rebuilds an instance, its fields are not set yet.
         kind = self.__dict__.get("type_name", "object")
         raise AttributeError(
             f"a {type(self).__name__} has no attribute {name!r}: it is the description of a {kind} "
@@ -53,14 +53,14 @@ class RemoteEnum(RemoteObject):
 def one_line(text: str, max_chars: int = MAX_REPR_CHARS) -> str:
     """Returns text that a terminal or a log prints on one line and never obeys, bounded."""
     line = printable(text[:max_chars], max_chars).replace("\n", "\\n").replace("\t", "\\t")
-    # Escapes are longer than what they stand for.
+    # An escape is longer than the character that it replaces, so cut again afterwards.
     return line if len(text) <= max_chars >= len(line) else line[:max_chars] + "..."
 
 
 def inert_copy(value: object) -> RemoteObject:
     """Turns any object into its inert description. A ``__repr__`` that raises is reported."""
     try:
-        # Addresses make equal things look different.
+        # Without memory addresses, equal objects have equal texts.
         text = _ADDRESS.sub("", repr(value))
     except Exception as error:
         text = f"<repr failed with {type(error).__name__}>"

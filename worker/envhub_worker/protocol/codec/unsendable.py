@@ -1,13 +1,13 @@
-"""What the wire does not carry as it is: pickled, named in an error, or described in its place.
+"""Values that the wire does not carry unchanged: pickled, named in an error, or described.
 
-What the caller hands over arrives exactly as it is, or is pickled as one piece: where a value holds
-anything that the wire's forms would change (the class of a mapping, the order of an array in
-memory, a lone surrogate), or anything beyond their limits, all of it is pickled. Only from client
-to worker: nothing that comes back is ever unpickled.
+The caller's arguments arrive exactly as they are. The whole argument is pickled if it holds a value
+that the wire's forms would change (the class of a mapping, the order of an array in memory, a lone
+surrogate) or that is over their limits. Pickles go from client to worker only: the client unpickles
+nothing.
 
-The rest runs only after a failure. The caller learns which part of a value cannot be sent. In what
-a runner sends, an inert description stands in the place of each such part, so that one part of a
-step's infos does not lose the rest of the step.
+The rest of this module runs only after a failure. An error tells the caller which part of a value
+cannot be sent. In a runner's reply an inert description replaces each such part, so that one bad
+info does not lose the rest of the step.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ _ARRAYS = frozenset("?bBhHiIlLqQefdFDmMS")
 
 
 def handed_over(value: object, pickler: Pickler, limits: WireLimits) -> object:
-    """The value itself, if the wire carries exactly that, or else its pickle."""
+    """Returns the value if the wire carries it exactly, else its pickle."""
     return value if _Judge(limits).holds(value, 0) else PickledValue(pickler(value))
 
 
 class _Judge:
-    """Says whether the wire's forms carry a value exactly, by the exact types of all that it holds.
+    """Decides by the exact types of a value and its members whether the wire carries it exactly.
 
-    Whatever it does not know is not exact: it is pickled, and that is exact.
+    A value of an unknown type counts as not exact, so it is pickled, which loses nothing.
     """
 
     __slots__ = ("_arrays_left", "_bytes_left", "_left", "_limits")
@@ -77,7 +77,7 @@ class _Judge:
         return value.bit_length() // 8 < self._limits.int_bytes
 
     def text(self, value: str, depth: int) -> bool:
-        """A text: none that UTF-8 cannot carry."""
+        """Whether UTF-8 can carry a text."""
         if value.isascii():
             return self.bytes(value, depth)
         try:
@@ -94,14 +94,14 @@ class _Judge:
         return plain and self.all(value, depth) and self.all(value.values(), depth)
 
     def elements(self, value: Any, depth: int) -> bool:
-        """A set of a few."""
+        """Whether a set is small and its elements are exact."""
         return len(value) <= _FEW and self.all(value, depth)
 
     def bounds(self, value: Any, depth: int) -> bool:
         return self.all((value.start, value.stop, value.step), depth)
 
     def array(self, value: Any, depth: int) -> bool:
-        """An array, as it lies in memory; strided ones are copied by pickle, too."""
+        """Whether an array keeps its layout in memory. Pickle copies strided arrays, too."""
         dtype = value.dtype
         self._arrays_left -= 1
         if self._arrays_left < 0 or value.ndim > MAX_DIMENSIONS:
@@ -171,7 +171,7 @@ def unpicklable(name: str, value: object, error: Exception, pickler: Pickler) ->
 def _culprit(
     text: str, value: object, error: Exception, pickler: Pickler, seen: set[int]
 ) -> tuple[str, object, Exception]:
-    """The path to the innermost value that cannot be pickled, the value, and its error."""
+    """Returns the innermost value that cannot be pickled: its path, the value and the error."""
     for step, child in _members(value):
         if id(child) in seen or len(seen) > _ATTEMPTS:
             continue
@@ -264,7 +264,7 @@ _SPARE = 64
 
 
 def reduced(message: list[Any], send: Send, limits: WireLimits) -> list[Any]:
-    """The fields of a message with descriptions in the place of what cannot be sent.
+    """Returns the fields of a message with a description in place of each part that cannot be sent.
 
     A field that is a mapping or a tuple stays one.
     """
@@ -287,7 +287,7 @@ class _Walk:
         self._text_left = limits.header_bytes // 2
 
     def value(self, value: Any, depth: int) -> Any:
-        """The value that is sent in its place."""
+        """Returns the value that is sent in place of ``value``."""
         kind = type(value)
         self._left -= 1
         if kind in _PLAIN or (kind is int and value.bit_length() < _SHORT):
@@ -307,7 +307,7 @@ class _Walk:
         return self.members(value, depth)
 
     def is_sent(self, value: object) -> bool:
-        """Whether it can be sent as it is. The error is not printed: that may fail, too."""
+        """Whether a value can be sent unchanged. Ignores the error: even its text may raise."""
         try:
             self._send(value)
         except Exception:

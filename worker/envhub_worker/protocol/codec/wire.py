@@ -36,7 +36,7 @@ class PickledValue:
 ARRAY, SCALAR, INTEGER, COMPLEX, PICKLE, PICKLE_FRAME = 1, 2, 3, 4, 5, 6
 # Extensions that head a msgpack array and say what its other elements make.
 TUPLE, SET, FROZENSET, RANGE, SLICE, OBJECTS, TEXT_SCALAR, TENSOR, ENUM, REMOTE = range(16, 26)
-# The same, of what only a client makes: one plain value that describes it.
+# Heads of descriptions, which only a client decodes: one plain value follows each.
 SPACE, SPEC, GENERATOR = range(26, 29)
 
 # The header frame: length of the msgpack document, the document, bytes of small arrays.
@@ -201,7 +201,8 @@ def _refuse_container(items: int, depth: int, limits: WireLimits) -> NoReturn:
 
 
 def _widths() -> tuple[int, ...]:
-    """By first byte: bytes of the whole token if positive, elements if negative, 0 for neither.
+    """A table by first byte: a positive entry is the token's bytes, a negative one its elements,
+    0 is neither.
 
     Elements are counted down from ``_NO_ELEMENTS``, so that an empty container is negative too.
     """

@@ -1,8 +1,8 @@
 """The manifest: what a repository's ``make_env`` returned, described as data.
 
-It is made in the jail and read in the client, so every reader here treats it as hostile: counts
-are bounded, names are strings of bounded length, spaces are checked before they are built. Keys of
-metadata on which Gymnasium acts are typed, and of a spec only the facts are taken: the rest of its
+The jail makes it and the client reads it, so every reader here treats it as hostile: counts are
+bounded, names are strings of bounded length, spaces are checked before they are built. Metadata
+keys that Gymnasium acts on have checked types. Readers take only the facts of a spec: its other
 fields are instructions.
 """
 
@@ -47,8 +47,8 @@ class EnvManifest:
         shardable: The worker drives the sub-environments itself, so they can be spread over several
             processes; otherwise the environment has a ``step`` of its own.
         sync: The repository asked for ``SyncVectorEnv``: its sub-environments may share state.
-        independent: Those of an asynchronous one were played apart and together in one process,
-            with equal results; otherwise each needs a process of its own.
+        independent: For ``AsyncVectorEnv``: the sub-environments gave equal results when played
+            apart and together in one process; otherwise each needs a process of its own.
         single_observation_space, single_action_space: Spaces of one sub-environment.
         observation_space, action_space: Batched spaces.
         autoreset_mode: ``"NextStep"``, ``"SameStep"``, ``"Disabled"``, or None if not stated.
@@ -77,9 +77,9 @@ class EnvManifest:
     type_name: str
 
     def own_batch(self, name: str) -> gym.Space[Any] | None:
-        """The batched space of this name where it is no batch of the single one, else None.
+        """The batched space of this name if it is not Gymnasium's batch of the single space.
 
-        A repository's own vector environment decides then what a batch is.
+        A repository's own vector environment may define its batches itself. Otherwise None.
         """
         batched, single = getattr(self, name), getattr(self, f"single_{name}")
         own = not self.shardable and not is_batch(batched, single, self.num_envs)
@@ -109,7 +109,7 @@ _FIELDS = frozenset(Manifest.__dataclass_fields__)
 
 
 def encode_env(manifest: EnvManifest, *, seeded: bool = False) -> dict[str, object]:
-    """The plain value of one environment's manifest; with the generators of ``seeded`` spaces."""
+    """Encodes one environment's manifest as a plain value, with generators of ``seeded`` spaces."""
     value = {name: getattr(manifest, name) for name in _ENV_FIELDS}
     described = {
         name: encode_space(value[name], seeded=seeded, single=value.get(f"single_{name}"))
@@ -119,7 +119,7 @@ def encode_env(manifest: EnvManifest, *, seeded: bool = False) -> dict[str, obje
 
 
 def encode_manifest(manifest: Manifest) -> dict[str, object]:
-    """The plain value of a manifest, with the generators of seeded spaces."""
+    """Encodes a manifest as a plain value, with the generators of seeded spaces."""
     return {
         "envs": tuple(encode_env(env, seeded=True) for env in manifest.envs),
         "lazy": manifest.lazy,
@@ -138,13 +138,13 @@ def decode_manifest(
     """Read a manifest. Trust: input from the worker.
 
     Args:
-        value: What the wire brought.
-        max_elements: What all spaces of all environments may cost together.
-        check: Called before each space; raises what ends the reading, such as a deadline.
-        generator: Makes a generator of a seeded space, of a state that it checks.
+        value: The decoded value.
+        max_elements: Budget of all spaces of all environments together.
+        check: Called before each space; may raise to end the reading, for example at a deadline.
+        generator: Checks a state and makes a seeded space's generator from it.
 
     Raises:
-        RemoteProtocolError: It is not a manifest, or over a limit.
+        RemoteProtocolError: The value is no manifest, or is over a limit.
     """
     with UNTRUSTED:
         fields = _mapping(value, _FIELDS, "a manifest")
@@ -165,7 +165,7 @@ def decode_manifest(
 
 def decode_env(value: object, *, max_elements: int) -> EnvManifest:
     """Read one environment's manifest. Trust: input from the worker.
-    Raises ``RemoteProtocolError``: it is not one, or over a limit.
+    Raises ``RemoteProtocolError``: the value is no manifest, or is over a limit.
     """
     with UNTRUSTED:
         return _decode_env(value, SpaceReader(max_elements))
@@ -210,7 +210,7 @@ def _typed(fields: Mapping[str, Any], name: str, kind: type) -> Any:
 
 
 def _attributes(value: object) -> tuple[str, ...]:
-    """The names, without those that are never served: honest classes have such names too."""
+    """Returns the servable names and drops the others, which honest classes have, too."""
     if type(value) is not tuple or len(value) > MAX_NAMES:
         raise RemoteProtocolError(f"attributes is not a tuple of at most {MAX_NAMES} names")
     return tuple(filter(is_servable, [checked_name(item, "attributes") for item in value]))
@@ -228,7 +228,7 @@ _NUMBERS = (int, float, np.integer, np.floating)
 
 
 def read_metadata_facts(value: object) -> dict[str, Any]:
-    """Free data for people, except for the keys that Gymnasium acts on: those are typed."""
+    """Reads metadata: free data for people, but keys that Gymnasium acts on have checked types."""
     metadata = string_keys(value, "metadata")
     _count(metadata, MAX_METADATA)
     return {
@@ -240,7 +240,7 @@ def read_metadata_facts(value: object) -> dict[str, Any]:
 
 
 def _count(value: object, left: int) -> int:
-    """How many more values metadata may hold. The depth is bounded by that of a message."""
+    """Returns how many more values metadata may hold. The wire's limits bound its depth."""
     left -= 1
     if isinstance(value, np.ndarray):
         left -= value.size
@@ -272,10 +272,10 @@ _METADATA_OF_GYMNASIUM: dict[str, Callable[[object], bool]] = {
 
 
 def read_spec_facts(value: object) -> dict[str, Any] | None:
-    """The facts of an ``EnvSpec``. Whatever else a worker says there is left out.
+    """Reads the facts of an ``EnvSpec`` and drops every other field.
 
-    The rest of its fields are instructions: which code makes the environment, with which
-    arguments, in which wrappers.
+    The other fields are instructions: which code makes the environment, with which arguments, in
+    which wrappers.
     """
     if value is None:
         return None

@@ -2,9 +2,9 @@
 
 Libraries look for methods under agreed names and call them unasked: ``copy`` calls
 ``__deepcopy__`` with everything that it has copied so far, numpy reads an address out of
-``__array_interface__`` and then reads and writes there, a notebook shows what ``_repr_html_``
-returns. Such a name must be the client's own or absent, whatever a worker lists. So a list of
-what is dangerous would never be complete; this is a list of forms that are not.
+``__array_interface__`` and then reads and writes there, a notebook shows the result of
+``_repr_html_``. Such a name must be the client's own or absent, whatever a worker lists. A list of
+dangerous names would never be complete, so this module lists the forms of harmless names.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PROBED = frozenset(
         *("to_numpy", "values", "index", "input_objs", "aval", "weak_type"),
         # by encoders to JSON, which call them: pandas, simplejson, wandb
         *("toDict", "for_json", "json_encode"),
-        # by notebooks: IPython's help and completion; by rich, which looks whether all is there
+        # by notebooks: IPython's help and completion; by rich, which probes for attributes
         *("getdoc", "trait_names", "awehoi234_wdfjwljet234_234wdfoijsdfmmnxpi492"),
     }
 )
@@ -53,10 +53,10 @@ GYMNASIUMS = frozenset(dir(VectorEnv)) | {
 
 
 def is_servable(name: str) -> bool:
-    """Whether an attribute of this name may be a worker's. Trust: input from the worker.
+    """Whether a worker may serve an attribute of this name. Trust: input from the worker.
 
-    An identifier without a leading underscore that means nothing to Gymnasium, nor to a library
-    that looks for it in any object; and the few with an underscore that callers really read.
+    Servable names are identifiers without a leading underscore that neither Gymnasium nor a
+    library looks for in arbitrary objects, and the few names with an underscore that callers read.
     """
     if name in SERVED_PRIVATE:
         return True
@@ -66,7 +66,7 @@ def is_servable(name: str) -> bool:
 
 
 def absent(owner: object, name: str, ask: str) -> AttributeError:
-    """The error of ``owner``, which does not serve ``name``; ``ask`` is its method that does."""
+    """Returns the error of ``owner`` for a ``name`` that only its method ``ask`` serves."""
     kind = type(owner).__name__
     if name not in PROBED:
         return AttributeError(f"{kind!r} object has no attribute {name!r}")
@@ -77,7 +77,9 @@ def absent(owner: object, name: str, ask: str) -> AttributeError:
 
 
 def checked_name(value: object, role: str) -> str:
-    """A printable text of bounded length. Raises ``RemoteProtocolError``: it is none."""
+    """Returns the value if it is a printable text of bounded length, else raises
+    ``RemoteProtocolError``.
+    """
     if type(value) is not str or len(value) > MAX_NAME:
         raise RemoteProtocolError(f"{role} is not a string of at most {MAX_NAME} characters")
     if not value.isprintable():  # names are printed all the time, and a terminal obeys what it gets
@@ -86,10 +88,10 @@ def checked_name(value: object, role: str) -> str:
 
 
 def checked_key(value: object, role: str) -> str:
-    """A name that can be part of a path: callers write videos and results under such names.
+    """Returns a name that is safe in a path: callers write videos and results under such names.
 
-    A slash is allowed (``ALE/Pong-v5``), for it leads further down.
-    Raises ``RemoteProtocolError``: it is no name, or leads out of the folder that it is put behind.
+    A slash is allowed (``ALE/Pong-v5``): it only leads into subfolders.
+    Raises ``RemoteProtocolError``: the value is no name, or would lead out of the caller's folder.
     """
     name = checked_name(value, role)
     parts = name.replace("\\", "/").split("/")
@@ -99,12 +101,12 @@ def checked_key(value: object, role: str) -> str:
 
 
 def optional_name(value: object, role: str) -> str | None:
-    """As ``checked_name``, or None."""
+    """Returns None for None, else ``checked_name``."""
     return None if value is None else checked_name(value, role)
 
 
 def string_keys(value: object, role: str) -> dict[str, Any]:
-    """A mapping with such names for keys. Raises ``RemoteProtocolError``."""
+    """Returns a mapping whose keys pass ``checked_name``. Raises ``RemoteProtocolError``."""
     if type(value) is not dict or len(value) > MAX_NAMES:
         raise RemoteProtocolError(f"{role} is not a mapping of at most {MAX_NAMES} entries")
     for key in value:

@@ -1,7 +1,8 @@
 """Lossless compression of a message's large frames, where both sides have agreed on it.
 
-A ``CompressionHeader`` goes in front of the frames and says how large each was. It is worth it on
-a network, for frames that shrink (rendered images do, noise does not): a sample tells.
+A ``CompressionHeader`` goes in front of the frames and holds each frame's original size.
+Compression pays on a network for frames that shrink, such as rendered images but not noise; a
+sample of each frame decides.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ _WORTH = 0.8
 
 
 def available() -> tuple[str, ...]:
-    """The compressions that can be had here, best first."""
+    """The compressions that this process supports, best first."""
     return () if _lz4() is None else ("lz4",)
 
 
 def pack_frames(frames: Sequence[Buffer], compression: str) -> list[Buffer]:
-    """The frames as they travel; unchanged where nothing is gained."""
+    """Returns the frames to send; unchanged if compression gains nothing."""
     block = _lz4() if compression == "lz4" else None
     if block is None or all(_size(frame) < SMALLEST for frame in frames):
         return list(frames)
@@ -44,7 +45,7 @@ def _packed(frame: Buffer, block: Any) -> bytes | None:
         return None
     view = memoryview(frame).cast("B")
     middle = max(0, len(view) // 2 - _SAMPLE // 2)
-    # copied first: what lies in shared memory may change while it is read
+    # Copied first: a frame in shared memory may change while it is read.
     sample = bytes(view[middle : middle + _SAMPLE])
     if len(block.compress(sample, store_size=False)) > _WORTH * len(sample):
         return None
@@ -56,8 +57,8 @@ def unpack_frames(frames: Sequence[Buffer], limits: WireLimits) -> list[Buffer]:
     """The frames as they were before ``pack_frames``.
 
     Trust: input from the other side. Every size is checked before it is allocated.
-    Raises ``MessageTooLargeError``: over ``limits`` once unpacked; ``RemoteProtocolError``: what is
-    there is not what ``CompressionHeader`` says.
+    Raises ``MessageTooLargeError``: over ``limits`` once unpacked; ``RemoteProtocolError``: the
+    frames do not match their ``CompressionHeader``.
     """
     if not frames or m.number_of(frames[0]) != 0:
         return list(frames)

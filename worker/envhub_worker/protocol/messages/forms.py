@@ -1,8 +1,9 @@
-"""What the codec has made of a received message, kept for the next one of the same document.
+"""A cache of decoded messages, by their msgpack documents.
 
-Steps, calls and requests to a server recur. When a document comes for the second time, what the
-codec makes of it is kept as a *form*, by the whole document: so a form says exactly what the codec
-would say. The bytes of arrays are no part of a document: they are read and checked each time.
+Steps, calls and requests to a server recur. When a document comes for the second time, the decoded
+message is kept as a *form*. The key is the whole document, so a form gives exactly the message that
+the codec would decode. The bytes of arrays lie outside the document: each message reads and checks
+its own.
 """
 
 from __future__ import annotations
@@ -26,10 +27,11 @@ _CONSTANTS = frozenset({float, int, bool, str, bytes, type(None)})
 
 
 class Forms:
-    """Forms by document; one is made when its document comes for the second time.
+    """Forms by document; a form is made when its document comes for the second time.
 
     Until then only a hash is kept: most documents that a server reads come once, with the number of
-    a jail or a time in them. Two documents of one hash only get their forms earlier.
+    a jail or a time in them. If two documents share a hash, the second gets its form one message
+    earlier.
     """
 
     def __init__(self) -> None:
@@ -38,10 +40,10 @@ class Forms:
         self.get = self._forms.get
 
     def met(self, document: bytes, make: Callable[[], Incoming]) -> None:
-        """Take note of a document that has no form, or none for these limits.
+        """Note that a document came that has no form for these limits.
 
-        The codec has already made the message. So if ``make`` fails, for whatever reason, there is
-        no form, and the codec makes the next message of this document too.
+        The codec has already decoded the message. If ``make`` fails for any reason, there is no
+        form, and the codec decodes the next message of this document, too.
         """
         hashed = hash(document)
         if hashed not in self._once and document not in self._forms:
@@ -60,16 +62,16 @@ class Forms:
 
 
 class Incoming:
-    """What to make of a document that was decoded before.
+    """The form of one document: makes messages of it without the codec.
 
     Args:
-        document: All of it.
-        tail, buffers: The bytes of its arrays, of ``split_frames``.
+        document: The whole document.
+        tail, buffers: The bytes of its arrays, from ``split_frames``.
         make: The class of the message.
-        limits: For which it was decoded, and holds.
+        limits: The limits that the document was decoded within; the form holds for these only.
 
     Raises:
-        Exception: There is no form for it: it holds more than constants, tuples, lists, dicts,
+        Exception: The document has no form: it holds more than constants, tuples, lists, dicts,
             arrays of numbers and tensors.
     """
 
@@ -103,8 +105,8 @@ class Incoming:
         *,
         borrows: bool = False,
     ) -> Message:
-        """The message; what of it can be changed is fresh. Trust: input from the other side.
-        ``borrows``: as ``ArrayReader`` has it.
+        """Returns a message whose mutable parts are new. Trust: input from the other side.
+        ``borrows``: as for ``ArrayReader``.
         """
         if self._constant is not None and not tail and not buffers:
             return self._constant
@@ -125,7 +127,7 @@ class Incoming:
 
 
 class IrregularError(Exception):
-    """A document that no form can be made of."""
+    """The document has no form: the codec decodes each of its messages."""
 
 
 class _Tensor:
@@ -136,15 +138,15 @@ class _Tensor:
 
 
 class _Array(NamedTuple):
-    """Stands for an array, or a tensor of this dtype, in a template: no form keeps an array."""
+    """Stands for an array, or for a tensor of this dtype, in a template: a form keeps no arrays."""
 
     described: tuple[Any, ...]
     tensor: str | None
 
 
 def _template(value: Any, notes: Iterator[tuple[Array, bytes]]) -> Any:
-    """The value with an ``_Array`` for each array.
-    ``notes``: the arrays of the document that have not been met yet, and their descriptors.
+    """Returns the value with an ``_Array`` in place of each array.
+    ``notes``: the document's remaining arrays, in order, with their descriptors.
     """
     kind = type(value)
     if kind in _CONSTANTS:
@@ -167,7 +169,7 @@ def _is_constant(part: Any) -> bool:
 
 
 def _fresh(part: Any, read: Callable[[_Array], object] | None = None) -> Any:
-    """A value of this template. ``read`` is called in the order of the document."""
+    """Makes a value of a template. Calls ``read`` for each array in the document's order."""
     kind = type(part)
     if kind in _CONSTANTS:
         return part

@@ -3,10 +3,10 @@
 A message is a record with a kind, and fields of fixed names and types. It travels as the value
 ``[kind, field, ...]`` in the codec's encoding: one msgpack header and raw buffers. ``unpack``
 checks the kind, the number of fields and each field's type, so that a decoded message is what its
-class says. Trust: what comes from a jail is hostile.
+class declares. Trust: messages from a jail are hostile.
 
-Between client and server an id ties a reply to its request. It stands in front of the header, so
-that a message that recurs is the same bytes again. Packets to a runner have ids of their own.
+Between client and server an id ties a reply to its request. It precedes the header, so that equal
+messages have equal headers. Packets to a runner have ids of their own.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 else:
 
     def dataclass_transform(**_: object) -> Callable[[type], type]:
-        """Tells type checkers of a constructor; here it has nothing to do."""
+        """Tells type checkers that the class has a constructor; does nothing at run time."""
         return lambda cls: cls
 
 
@@ -39,7 +39,7 @@ FIRST_RUNNER_KIND = 64
 """Kinds from here on are between client and runner; a runner may send no other."""
 
 
-# a field's annotation, and the types that a decoded value of it may have
+# A field's annotation, and the types that its decoded value may have.
 _ACCEPTED: dict[str, frozenset[type] | None] = {
     "int": frozenset({int}),
     "bool": frozenset({bool}),
@@ -62,9 +62,10 @@ KINDS: dict[int, type[Message]] = {}
 class Message(FrozenRecord):
     """Base of all messages; ``kind`` is its number on the wire and never changes.
 
-    ``FIELDS`` are what a class annotates, in the order in which they travel. ``HANDED`` are those
-    that are the caller's own: they arrive exactly as they are, pickled if need be. ``ASKS`` is what
-    the caller calls it, for errors; with the name of what is called, if the message has one.
+    ``FIELDS`` are the annotated fields of a class, in the order in which they travel. ``HANDED``
+    names the fields that hold the caller's own objects: they arrive exactly as they are, pickled if
+    need be. ``ASKS`` is the caller's name for the request, which errors use; it may include the
+    name of the called method.
     """
 
     kind: ClassVar[int]
@@ -100,8 +101,8 @@ def values_of(message: Message) -> list[Any]:
 
 
 def check_fields(cls: type[Message], values: list[object]) -> None:
-    """Whether decoded values are fields of this message. Trust: input from the other side.
-    Raises ``RemoteProtocolError``: they are too many, too few, or of another type.
+    """Checks decoded values against the fields of a message. Trust: input from the other side.
+    Raises ``RemoteProtocolError``: there are too many, too few, or one has another type.
     """
     names = cls.FIELDS
     if len(values) != len(names):
@@ -130,10 +131,10 @@ def pack(
     describer: Describer | None = None,
     reduces: bool = False,
 ) -> list[Buffer]:
-    """The frames of a message.
+    """Encodes a message as frames.
 
-    With a pickler, what the caller hands over (``Message.HANDED``) arrives exactly as it is.
-    ``reduces``: as ``encode`` has it.
+    With a pickler, the caller's own objects (``Message.HANDED``) arrive exactly as they are.
+    ``reduces``: as for ``encode``.
     Raises ``LocalProtocolError``: a field holds what the wire cannot carry; nothing was sent.
     """
     cls = type(message)
@@ -150,7 +151,7 @@ def pack(
 def _handed(
     message: Message, values: list[Any], pickler: Pickler, limits: WireLimits
 ) -> list[object]:
-    """The fields as they are sent: the caller's own objects in them are pickled."""
+    """Returns the fields to send, in which the caller's own objects are pickled if need be."""
     from envhub_worker.protocol.codec.unsendable import handed_over, unpicklable
 
     sent = list(values)
@@ -166,7 +167,7 @@ def _handed(
 
 
 def _asked(message: Message) -> str:
-    """The caller's call, as a prefix for an error about its arguments."""
+    """Returns a prefix for an error about the arguments of the caller's call."""
     if not message.ASKS:
         return ""
     name = getattr(message, "name", None)
@@ -182,7 +183,7 @@ def unpack(
     things: ThingReader | None = None,
     borrows: bool = False,
 ) -> Message:
-    """The message of some frames; ``borrows``: as ``Decoder`` has it.
+    """Decodes frames as a message; ``borrows``: as for ``Decoder``.
     Raises ``RemoteProtocolError``: the peer broke the rules.
     """
     with UNTRUSTED:
@@ -204,7 +205,7 @@ def unpack(
 
 
 def _alone(frames: Sequence[Buffer]) -> bytes:
-    """A small header without other frames: such messages recur. Empty for others."""
+    """Returns the header if it is small and the only frame, else b"": such messages recur."""
     if len(frames) != 1:
         return b""
     header = frames[0] if type(frames[0]) is bytes else memoryview(frames[0]).cast("B")
@@ -212,18 +213,18 @@ def _alone(frames: Sequence[Buffer]) -> bytes:
 
 
 def pack_header(message: Message, number: int) -> list[Buffer]:
-    """The frames of a message between client and server, with its id in front."""
+    """Encodes a message between client and server, with its id in front of the header."""
     header, *buffers = pack(message)
     return [with_id(header, number), *buffers]
 
 
 def with_id(header: Buffer, number: int) -> Buffer:
-    """A header with the id of its request in front."""
+    """Puts the id of a request in front of a header."""
     return _NUMBER.pack(number) + header
 
 
 def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> tuple[int, Message]:
-    """The id and the message of a header. Trust: input from the other side.
+    """Decodes a header as its id and its message. Trust: input from the other side.
     Raises ``RemoteProtocolError``: the peer broke the rules.
     """
     number = id_of(frame)
@@ -237,7 +238,7 @@ def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> tupl
 
 
 def without_id(frame: Buffer) -> Buffer:
-    """What comes after the id of a header."""
+    """Returns the header without the id in front."""
     return frame[_NUMBER.size :] if type(frame) is bytes else memoryview(frame)[_NUMBER.size :]
 
 

@@ -1,8 +1,8 @@
-"""What a runner says in front of a reply: a message in the first frame, the reply in the others.
+"""Prefixes of replies: a message of the runner's own in the first frame, the reply in the others.
 
-Where there is something to say, a reply has at least two frames, and the kind of the first says
-what it is. Where there is nothing to say, nothing is sent: a reply without ``CHANGES`` says that
-all watched attributes are as they were.
+A reply with a prefix has at least two frames, and the kind of the first names the prefix. A runner
+with nothing to report sends no prefix: a reply without ``CHANGES`` means that no watched attribute
+has changed.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ _LIST = 0x90
 
 
 class Prefix(Generic[T]):
-    """One kind of message in front of replies, with one field: a tuple of things.
+    """One kind of prefix: a message with one field, a tuple of items.
 
     Args:
-        kind: The message.
-        item_bytes: The most that one thing takes.
-        check: Makes a thing of a decoded value, or raises ``RemoteProtocolError``.
+        kind: The class of the message.
+        item_bytes: Maximum size of one item.
+        check: Makes an item of a decoded value, or raises ``RemoteProtocolError``.
 
     Attributes:
-        most: Things in front of one reply.
+        most: Maximum number of items in one prefix.
     """
 
     most = 16
@@ -69,12 +69,12 @@ class Prefix(Generic[T]):
         self._head = bytes([_LIST + 1 + len(kind.FIELDS), kind.kind])
 
     def put(self, things: Sequence[T], frames: Sequence[Buffer]) -> list[Buffer]:
-        """A reply's frames behind these items."""
+        """Puts items in front of a reply's frames."""
         return [*pack(self._kind(tuple(things))), *frames]
 
     def read(self, frames: Sequence[Buffer]) -> tuple[list[T], Sequence[Buffer]]:
-        """The things in front of a reply, and its own frames. Trust: input from the worker.
-        Raises ``RemoteProtocolError``: they are too many or too large, or something else.
+        """Returns the items of a prefix and the reply's own frames. Trust: input from the worker.
+        Raises ``RemoteProtocolError``: the items are too many, too large, or of another type.
         """
         end = _LENGTH_BYTES + len(self._head)
         if len(frames) < 2 or memoryview(frames[0]).cast("B")[_LENGTH_BYTES:end] != self._head:
@@ -83,7 +83,7 @@ class Prefix(Generic[T]):
             return list(map(self._check, self._things(frames[0]))), frames[1:]
 
     def _things(self, frame: Buffer) -> tuple[object, ...]:
-        """The items of a frame, whose size is checked before it is decoded."""
+        """Decodes the items of a frame after a check of its size."""
         size, name = memoryview(frame).nbytes, self._kind.__name__
         if size > self._max_bytes:
             text = f"{size} bytes of {name} are over the limit of {self._max_bytes}."

@@ -17,8 +17,8 @@ stands for the whole, as of an enum's member. ``computed`` has the values of its
 class Load(Message, kind=64, asks="make_env", handed=("cfg", "env_kwargs")):
     """Import the entry file and call its ``make_env``. Reply: ``LoadDone`` or ``RaisedException``.
 
-    ``cfg`` holds the ``vars()`` of the caller's config object, or None; see ``CONFIG_CLASS``. For
-    ``play_ms`` milliseconds from now on sub-environments may be played to see whether they are
+    ``cfg`` holds the ``vars()`` of the caller's config object, or None; see ``CONFIG_CLASS``. The
+    runner may play sub-environments for ``play_ms`` milliseconds to see whether they are
     independent.
     """
 
@@ -30,7 +30,7 @@ class Load(Message, kind=64, asks="make_env", handed=("cfg", "env_kwargs")):
 
 
 class LoadDone(Message, kind=65):
-    """What the repository's ``make_env`` returned: see ``manifest.decode_manifest``."""
+    """The manifest of the environments that ``make_env`` returned: see ``decode_manifest``."""
 
     manifest: dict[str, object]
 
@@ -46,13 +46,13 @@ class Build(Message, kind=66):
 
 
 class BuildDone(Message, kind=67):
-    """The slice is ready: see ``manifest.decode_env``."""
+    """The slice is ready; with its manifest: see ``decode_env``."""
 
     manifest: dict[str, object]
 
 
 class Reset(Message, kind=68, asks="reset", handed=("options",)):
-    """``seeds`` is None or one seed or None per sub-environment of the slice; so is ``mask``."""
+    """Reset the slice. ``seeds`` and ``mask`` are None or have one entry per sub-environment."""
 
     env: int
     seeds: object
@@ -148,18 +148,19 @@ class CallOne(Message, kind=79, asks="envs", handed=("args", "kwargs")):
 
 
 class GetRandom(Message, kind=80):
-    """Ask for the generators. Reply: ``Value``, one state each, or the one state there is.
+    """Ask for the generators' states. Reply: ``Value`` with one state per sub-environment, or the
+    state of the vector environment's only generator.
 
-    A state has a ``number`` beside numpy's fields: another generator has another one.
+    A state has a ``number`` beside numpy's fields, which identifies the generator.
     """
 
     env: int
 
 
 class SetRandom(Message, kind=94):
-    """Bring generators to these states; None leaves one as it is. Reply: ``Value``.
+    """Set generators to these states; None leaves a generator unchanged. Reply: ``Value``.
 
-    ``new``: by generators of their own, which take the places of those that are there.
+    ``new``: make new generators in these states, which replace the present ones.
     """
 
     env: int
@@ -174,10 +175,11 @@ class Close(Message, kind=81):
 
 
 class Attach(Message, kind=82):
-    """Serve an environment's steps over the slabs and doorbells that come along. Reply: ``Value``.
+    """Serve steps over the slabs and doorbells that this message brings. Reply: ``Value``.
 
     The shard's rows of a batch of ``count`` begin at ``start``. If ``count`` is 0, steps are
-    messages, and a slot is for the answer to one. False: it has no fixed layout.
+    messages, and a slot holds the answer to one step. The value False means that the environment
+    has no fixed layout.
     """
 
     env: int
@@ -187,16 +189,16 @@ class Attach(Message, kind=82):
 
 
 class FetchInfos(Message, kind=83):
-    """Ask for the last step's infos, which did not fit the slab. Reply: ``Value``."""
+    """Ask for the last step's infos, which did not fit into the slab. Reply: ``Value``."""
 
     env: int
 
 
 class Revive(Message, kind=84):
-    """Reset all sub-environments in the place of others, which died in the middle of an episode.
+    """Reset all sub-environments, which replace others that died in the middle of an episode.
 
-    Reply: ``StepDone``: the fresh observations, rewards of zero, every episode truncated. What
-    the next step does with those is as the autoreset mode says.
+    Reply: ``StepDone`` with the new observations, zero rewards, and every episode truncated. The
+    autoreset mode decides what the next step does with the truncated episodes.
     """
 
     env: int
@@ -204,9 +206,9 @@ class Revive(Message, kind=84):
 
 
 class FetchInfosApart(Message, kind=85):
-    """Ask for the last infos as each sub-environment gave them. Reply: ``Value`` of triples.
+    """Ask for the last infos as each sub-environment returned them. Reply: ``Value`` of triples.
 
-    ``failed``: those cannot be joined, and the step that they are of has failed. None are sent.
+    ``failed``: the infos cannot be joined and their step has failed, so the reply holds none.
     """
 
     env: int
@@ -214,13 +216,13 @@ class FetchInfosApart(Message, kind=85):
 
 
 class TakeApart(Message, kind=93):
-    """Infos are not joined from now on, but each sub-environment's own. Reply: ``Value``."""
+    """From now on send each sub-environment's own infos, not joined ones. Reply: ``Value``."""
 
     env: int
 
 
 class LoadTask(Message, kind=86, asks="make_env", handed=("cfg", "env_kwargs")):
-    """As ``Load``, where the manifest is known. Reply: ``Value`` or ``RaisedException``."""
+    """Like ``Load``, but the client has the manifest. Reply: ``Value`` or ``RaisedException``."""
 
     n_envs: int
     use_async_envs: bool
@@ -237,27 +239,27 @@ class Value(Message, kind=87):
 
 
 class Warnings(Message, kind=88):
-    """In front of the frames of a reply: what the repository has warned of."""
+    """In front of the frames of a reply: the warnings that the repository has issued."""
 
     warnings: tuple[object, ...]
 
 
 class Watch(Message, kind=89, asks="call"):
-    """As ``Call`` without arguments; its result is watched from now on. Reply: ``WatchDone``."""
+    """Like ``Call`` without arguments; the runner then watches its result. Reply: ``WatchDone``."""
 
     env: int
     name: str
 
 
 class WatchDone(Message, kind=90):
-    """What ``Call`` would have answered, and whether it stays so until a ``Changes`` says other."""
+    """The result of ``Call``, and whether it stays valid until ``Changes`` names the attribute."""
 
     value: object
     watched: bool
 
 
 class Changes(Message, kind=91):
-    """In front of the frames of a reply: what is another now, and watched no more."""
+    """In front of the frames of a reply: attributes that have changed, so are watched no more."""
 
     attributes: tuple[object, ...]
 

@@ -37,15 +37,15 @@ _NAME = r"[a-z_]{1,32}"
 
 @dataclass(frozen=True)
 class Busy:
-    """What a ``Refusal`` for want of room says, whose ``error`` is then ``BUSY_ERROR``.
+    """The details of a ``Refusal`` for lack of room, whose ``error`` is ``BUSY_ERROR``.
 
-    A client that knows nothing of it has a ``WorkerError`` with the text.
+    A client that does not know that error raises a ``WorkerError`` with the text.
 
     Attributes:
-        quota: Its name; travels as ``missing``.
-        used: How much of it others of the same key have.
-        limit: How much there is.
-        retry_s: After how many seconds it is worth asking again.
+        quota: The name of the quota; travels as ``missing``.
+        used: How much of the quota the key's other sessions use.
+        limit: The whole quota.
+        retry_s: Seconds after which the client may try again.
     """
 
     quota: str
@@ -54,12 +54,12 @@ class Busy:
     retry_s: float
 
     def words(self) -> str:
-        """The numbers, which travel as ``fix``."""
+        """The numbers as text, which travels as ``fix``."""
         return f"{self.used} {self.limit} {self.retry_s:.3f}"
 
 
 class Refusal(Message, kind=3):
-    """The server did not do it. ``error`` is a name out of a table in the client; see ``Busy``."""
+    """The server refuses a request. ``error`` is a name in a table of the client; see ``Busy``."""
 
     error: str
     message: str
@@ -68,7 +68,7 @@ class Refusal(Message, kind=3):
 
     @property
     def busy(self) -> Busy | None:
-        """Why there is no room, if that is why; with nothing in it where that is not said rightly.
+        """Returns the details if the server lacks room; an empty ``Busy`` if they are malformed.
 
         Trust: input from the worker.
         """
@@ -97,16 +97,16 @@ class OpenJail(Message, kind=4):
 
     @property
     def runtime(self) -> Runtime:
-        """What runs the repository."""
+        """Returns the interpreter and the packages of the repository."""
         return Runtime(self.python, self.packages)
 
     @property
     def repositories(self) -> tuple[HubCopy, ...]:
-        """What the jail's cache of the Hub holds; raises ``RemoteProtocolError``."""
+        """Returns the contents of the jail's Hub cache. Raises ``RemoteProtocolError``."""
         return read_hub_copies(self.hub_copies)
 
     def with_trees(self, trees: Mapping[str, str]) -> tuple[object, ...]:
-        """``hub_copies`` with these paths in place of the names of trees."""
+        """Returns ``hub_copies`` with paths in place of the names of trees."""
         repositories = self.repositories
         return tuple((*copy[:3], trees.get(copy.tree, copy.tree)) for copy in repositories)
 
@@ -153,7 +153,7 @@ class RelayDone(Message, kind=8):
 class Death(Message, kind=9):
     """A process of the jail ended. Trust: ``tail`` is the jail's own output, escaped.
 
-    ``runner`` is -1 where it was all of the jail.
+    ``runner`` is -1 if the whole jail ended.
     """
 
     runner: int
@@ -172,13 +172,13 @@ class CloseJail(Message, kind=10):
 
 
 class Done(Message, kind=11):
-    """It is done, and there is nothing to say about it."""
+    """The request is done and has no result."""
 
 
 class ReadOutput(Message, kind=12):
     """Ask for the last lines that a jail printed. Reply: ``Output``, or ``Death``.
 
-    ``operation`` is what ``Death`` then says the client was waiting for.
+    ``operation`` is the client's pending operation, which a ``Death`` then names.
     """
 
     jail: int
@@ -219,10 +219,10 @@ class KeepJail(Message, kind=17):
 
 
 class RelayDonePartly(Message, kind=18):
-    """As ``RelayDone``, of a jail that is kept, where some runners have died.
+    """Like ``RelayDone``, for a kept jail (``KeepJail``) in which some runners have died.
 
-    ``dead`` holds their places in the request; what stands there is the server's own ``Death``,
-    in one frame. What runners send never counts as such, whatever it says.
+    ``dead`` holds their indices in the request; the part at each is the server's own ``Death``, in
+    one frame. A runner cannot forge one: a part outside ``dead`` never counts as a death.
     """
 
     parts: tuple[int, ...]
@@ -230,15 +230,15 @@ class RelayDonePartly(Message, kind=18):
 
 
 class OfferSnapshot(Message, kind=19):
-    """A snapshot's files, each ``(path, size, sha256)``, of programs with True at its end. Reply:
-    ``MissingBlobs`` or ``Refusal``.
+    """A snapshot's files, each ``(path, size, sha256)``; an executable file has True as a fourth
+    element. Reply: ``MissingBlobs`` or ``Refusal``.
     """
 
     files: tuple[object, ...]
 
 
 class MissingBlobs(Message, kind=20):
-    """The hashes that the server does not have. None: ``OpenJail`` may name ``snapshot``."""
+    """The hashes that the server lacks. If it lacks none, ``OpenJail`` may name ``snapshot``."""
 
     snapshot: str
     hashes: tuple[object, ...]
@@ -247,7 +247,7 @@ class MissingBlobs(Message, kind=20):
 class PutBlob(Message, kind=21):
     """One piece of a wanted file, in order; the frame that follows holds it. Reply: ``Done``.
 
-    With the last piece the whole is compared with its hash.
+    After the last piece the server compares the file with its hash.
     """
 
     sha256: bytes
@@ -267,9 +267,9 @@ class Agree(Message, kind=23):
 
 
 class Agreement(Message, kind=24):
-    """The compression of both directions from here on, or ``""``; and the server's patience.
+    """The compression of all later messages, or ``""``; and how long the server waits.
 
-    Jails of a client that is not heard from for ``idle_s`` seconds are ended; 0 means never.
+    The server ends the jails of a client that is silent for ``idle_s`` seconds; 0 means never.
     """
 
     compression: str
@@ -277,7 +277,7 @@ class Agreement(Message, kind=24):
 
 
 class CompressionHeader(Message, kind=25):
-    """In front of frames: the size of each when unpacked, or -1 for one that is as it was."""
+    """In front of frames: each frame's unpacked size, or -1 for a frame without compression."""
 
     compression: str
     sizes: tuple[int, ...]
@@ -302,7 +302,7 @@ class FollowOutput(Message, kind=28):
 
 
 class OutputBytes(Message, kind=29):
-    """Bytes that a jail printed. Trust: raw; what lay before ``start`` is not kept any more."""
+    """Bytes that a jail printed. Trust: raw. The server has dropped the bytes before ``start``."""
 
     start: int
     data: bytes
@@ -318,13 +318,13 @@ class ExpireIdle(Message, kind=30):
 class NeedPackages(Message, kind=31):
     """Ask a server on another host for a repository's packages. Reply: ``Packages`` or ``Refusal``.
 
-    It makes them in its own time, and says at once how far it is: the client asks again.
-    ``requirements`` has pairs, a plain requirement and where it stands; ``supports`` are the
-    versions of Python that the repository runs in, ``python`` the version that the caller asks for.
-    Where ``always`` is not set, the server's own packages do if they meet all of it. ``guesses``
-    are taken only where nothing else brings the module: a requirement, where it stands, the module,
-    and the names of the distributions that bring it, with spaces between them. ``constraints`` and
-    ``override`` are pairs as ``requirements`` are, ``without`` names of packages.
+    The server builds in the background and reports its progress at once: the client asks again.
+    ``requirements`` has pairs: a requirement and the file that states it. ``supports`` are the
+    versions of Python that the repository runs in, ``python`` is the version that the caller wants.
+    Without ``always``, the server's own packages are used if they meet all requirements.
+    ``guesses`` count only if nothing else brings the module: a requirement, the file that imports
+    the module, the module, and the distributions that bring it, separated by spaces.
+    ``constraints`` and ``override`` are pairs like ``requirements``, ``without`` names of packages.
     """
 
     requirements: tuple[object, ...]
@@ -340,10 +340,10 @@ class NeedPackages(Message, kind=31):
 
 
 class Packages(Message, kind=32):
-    """How far they are. ``state`` is ``"making"``, ``"made"``, or ``"own"`` for the server's own.
+    """The state of packages: ``"making"``, ``"made"``, or ``"own"`` for the server's own packages.
 
-    ``name`` is what ``OpenJail`` may call them, ``progress`` a line for people. ``facts`` are the
-    lock's hash and the pins.
+    ``name`` is their name in ``OpenJail``, ``progress`` a line for people. ``facts`` are the lock's
+    hash and the pins.
     """
 
     state: str
@@ -353,7 +353,7 @@ class Packages(Message, kind=32):
 
 
 class ShareSlabs(Message, kind=33):
-    """Make slabs and doorbells for runners. Reply: ``Done``, or ``Refusal``: they are too large."""
+    """Make slabs and doorbells for runners. Reply: ``Done``, or ``Refusal`` of too large slabs."""
 
     jail: int
     slabs: tuple[object, ...]

@@ -1,8 +1,8 @@
-"""A step's results as columns, where a step is a message: only what differs, without a codec.
+"""Results of a step that is a message, as columns: changed values only, without the codec.
 
-Most steps return the same classes, keys, shapes and dtypes as the last. Both sides derive the
-columns from one message that went encoded; while results have that form, their numbers and texts
-alone are written. No offset, class or key comes from the jail in between.
+Most steps return the same classes, keys, shapes and dtypes as the step before. Both sides derive
+the columns from one encoded message; while later results have that form, only their numbers and
+texts are written. No offset, class or key comes from the jail in between.
 
 Arrays, and bits of tensors, have a place each in the slot of the observation slab. Scalars are a
 list in msgpack, in the reply slab's area of infos.
@@ -35,18 +35,18 @@ _Make = Callable[[Iterator[Any], Iterator[Any]], Any]
 
 
 class StepColumns:
-    """The columns of results like these.
+    """The columns of results that have the form of ``values``.
 
     Args:
         values: The fields of one message.
         room: Bytes of a slot.
 
     Attributes:
-        nbytes: What the arrays take in a slot.
+        nbytes: Bytes of a slot that the arrays take.
 
     Raises:
-        IrregularError: They are more than numbers, texts, arrays of numbers, tensors, None and
-            bytes, in tuples, lists and dicts by text; or too many, or too large.
+        IrregularError: The values are not only numbers, texts, arrays of numbers, tensors, None and
+            bytes, in tuples, lists and dicts with text keys; or are too many, or too large.
     """
 
     def __init__(self, values: Sequence[Any], room: int) -> None:
@@ -62,7 +62,7 @@ class StepColumns:
         named = enumerate(name for _, _, _, name in self._arrays)
         self._tensors = [(index, name) for index, name in named if name]
 
-    # --- what they are -------------------------------------------------------------------------
+    # --- deriving the columns ------------------------------------------------------------------
 
     def _part(self, value: Any) -> tuple[_Take, _Make]:
         self._parts += 1
@@ -127,7 +127,7 @@ class StepColumns:
         take = partial(_take_tensor if name else _take_array, array.dtype, array.shape)
         return take, lambda scalars, found: next(found)
 
-    # --- out and in ----------------------------------------------------------------------------
+    # --- writing and reading -------------------------------------------------------------------
 
     def write(self, values: Sequence[Any], memory: Any, start: int) -> bytes:
         """Write arrays into the slot at ``start``; returns the scalars, packed.
@@ -151,7 +151,7 @@ class StepColumns:
         self, memory: Any, start: int, packed: bytes, tensors: TensorMaker, slot: Any = None
     ) -> list[Any]:
         """The fields of the message, out of the slot at ``start``. Trust: input from the worker.
-        ``slot``: a map of it, to which large arrays are to refer; else all are copies.
+        ``slot``: a map of the slot, into which large arrays are views; without it all are copies.
         """
         copies = self._copies.get(start)
         if copies is None:

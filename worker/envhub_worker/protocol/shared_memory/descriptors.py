@@ -2,22 +2,23 @@
 
 Followed: ``memfd_create(2)``, ``fcntl(2)`` on sealing.
 
-The doorbells of the fast lane: nothing here can wait on what the jail does with its copies.
+The doorbells of the fast lane: no call here waits for what the jail does with its copies.
 
-The flags and the counter of an open file description belong to everybody who holds it. A jail that
-holds our eventfd can fill it and clear ``O_NONBLOCK``: then our next ``write`` to it never returns;
-it can empty it between our ``poll`` and our ``read``. So we do neither.
+All holders of an open file description share its flags and its counter. A jail that holds our
+eventfd can fill it and clear ``O_NONBLOCK``: then our next ``write`` to it never returns. It can
+also empty the eventfd between our ``poll`` and our ``read``. So we neither write to it nor read it.
 
 *We ring* through a socket pair, each end of which is a description of its own. ``MSG_DONTWAIT`` is
-our word alone, and a full socket has been rung already; ``MSG_NOSIGNAL``, because the jail may
-close its end. Our end receives nothing (``SHUT_RD``): what is sent to it fails at the sender's.
-Descriptors would otherwise wait in our queue and be closed by us, which takes as long as their
-file systems and sockets please. A pipe would not do: its two ends share a lock, which a reader
-holds while its page faults are served, and a broken one raises SIGPIPE.
+a flag of our call, which the jail cannot clear; a full socket has been rung already.
+``MSG_NOSIGNAL``, because the jail may close its end. Our end receives nothing (``SHUT_RD``): a
+``send`` to it fails at the sender. Otherwise the jail could queue descriptors there, and we would
+have to close them, which takes as long as their file systems and sockets please. A pipe would not
+do: its two ends share a lock, which a reader holds while its page faults are served, and a write to
+a broken pipe raises SIGPIPE.
 
-*The jail rings* through an eventfd that we only watch, edge by edge: each of its writes wakes us
-once, and there is nothing to take back. It may fill it, empty it, close it or write to it without
-end: then it is not heard, or costs us as many wake-ups as it makes system calls itself.
+*The jail rings* through an eventfd that we only watch, edge-triggered: each write wakes us once,
+and we never read it. The jail may fill, empty or close it, or write to it without end: then we do
+not hear the jail, or wake up as often as it makes system calls itself.
 
 Followed: ``eventfd(2)``, ``epoll(7)``, ``unix(7)``, ``send(2)``.
 """
@@ -42,8 +43,8 @@ this file too."""
 def sealed_memfd(name: str, size: int, further_seals: int = 0) -> tuple[mmap.mmap, io.FileIO]:
     """A sealed memfd of a fixed size, mapped here, and its file.
 
-    Without the seals a jail could cut the memory, and the next look at it would be a SIGBUS. It is
-    a file and no number: interruption.md, rule 5.
+    Without the seals a jail could truncate the memory, and our next access would be a SIGBUS.
+    The descriptor is a file object, not a number: interruption.md, rule 5.
     """
     file = io.FileIO(os.memfd_create(f"envhub-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING), "r+")
     file.truncate(size)
@@ -59,7 +60,7 @@ _AT_ONCE = socket.MSG_DONTWAIT | getattr(socket, "MSG_NOSIGNAL", 0)
 
 
 class RunnerBell:
-    """The doorbell that we ring, and a runner hears.
+    """The doorbell that we ring and a runner hears.
 
     Attributes:
         theirs: The runner's end.
@@ -72,7 +73,7 @@ class RunnerBell:
         self.theirs = self._theirs.fileno()
 
     def handed_over(self) -> None:
-        """The runner has its copy. Idempotent."""
+        """Close our copy of the runner's end once the runner has its own. Idempotent."""
         self._theirs.close()
 
     def ring(self) -> None:
@@ -89,10 +90,11 @@ class RunnerBell:
 
 
 class OwnBell:
-    """The doorbell that a runner rings and we hear. It is watched, and neither read nor written."""
+    """The doorbell that a runner rings and we hear. We only watch it: no read and no write."""
 
     def __init__(self) -> None:
-        # as a file it is closed with its last owner, whatever interrupts that one
+        # A file object closes its descriptor with its last reference, whatever interrupts the code
+        # that holds it.
         self._file = io.FileIO(os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK), "r+")
 
     def fileno(self) -> int:
@@ -112,22 +114,22 @@ class Watch:
         self._deaths: set[int] = set()
 
     def bell(self, bell: OwnBell) -> None:
-        """Wake up at its rings; one that came before counts, too."""
+        """Watch a doorbell: each ring wakes ``wait``, and so does an earlier ring."""
         self._epoll.register(bell, select.EPOLLIN | select.EPOLLET)
 
     def death(self, fd: int) -> None:
-        """Wake up for as long as this is readable: a process has ended."""
+        """Watch a pidfd, which is readable from the end of its process on."""
         self._epoll.register(fd, select.EPOLLIN)
         self._deaths.add(fd)
 
     def forget(self, source: OwnBell | int) -> None:
-        """Before it is closed: the jail has a copy, and would go on ringing it."""
+        """Stop watching. Call it before the close: the jail's copy would ring on."""
         self._epoll.unregister(source)
         if isinstance(source, int):
             self._deaths.discard(source)
 
     def wait(self, timeout_ms: int | None) -> bool:
-        """Wait for a ring or a death, or None for ever; whether it was a death."""
+        """Wait for a ring or a death, without a limit for None; returns whether it was a death."""
         deaths, timeout_s = self._deaths, -1 if timeout_ms is None else timeout_ms / 1000
         for fd, _ in self._epoll.poll(timeout_s, _EVENTS):  # noqa: SIM110 - the hot path
             if fd in deaths:
@@ -135,7 +137,7 @@ class Watch:
         return False
 
     def fileno(self) -> int:
-        """Readable when there is something to wait for: it can be polled among others."""
+        """A descriptor that is readable when ``wait`` would return, for use in another poll."""
         return self._epoll.fileno()
 
     def close(self) -> None:

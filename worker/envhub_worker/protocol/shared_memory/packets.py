@@ -1,6 +1,6 @@
-"""The frames of a message in a slab: their number, their lengths, and each at a cache line.
+"""The frames of a message in a slab: their number, their lengths, then each at a cache line.
 
-They begin where arrays may begin, so that an array that came as a frame can be used where it lies.
+A cache line is aligned for every dtype, so an array can be used in place, without a copy.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _COUNT = struct.Struct("<Q")
 
 
 def array_start(frames: Sequence[Buffer], nbytes: int) -> int:
-    """Where the bytes of the only array of a message lie in its packet."""
+    """The offset, in a packet, of the bytes of a message's only array."""
     lengths = _lengths(frames)
     starts = _starts(lengths)
     return starts[1] if len(lengths) > 1 else starts[0] + lengths[0] - nbytes
@@ -29,7 +29,7 @@ def array_start(frames: Sequence[Buffer], nbytes: int) -> int:
 
 @lru_cache(maxsize=64)
 def _starts(lengths: tuple[int, ...]) -> tuple[int, ...]:
-    """Where each frame begins, and one more frame would."""
+    """The offset of each frame, and of the end of the last."""
     sizes = [_COUNT.size * (1 + len(lengths)), *lengths]
     return tuple(accumulate(-(-size // LINE) * LINE for size in sizes))
 
@@ -39,7 +39,7 @@ def _lengths(frames: Sequence[Buffer]) -> tuple[int, ...]:
 
 
 def packet_bytes(frames: Sequence[Buffer]) -> int:
-    """What a packet of these frames takes."""
+    """The size of a packet of frames."""
     return _starts(_lengths(frames))[-1]
 
 
@@ -57,10 +57,10 @@ def write_packet(memory: Any, start: int, room: int, frames: Sequence[Buffer]) -
 
 
 def read_packet(memory: memoryview, limits: WireLimits) -> list[Buffer]:
-    """The frames of a packet; all but the first lie in the slab.
+    """Returns the frames of a packet; all but the first are views of the slab.
 
-    Trust: input from a peer that may write meanwhile. Each number is read once.
-    Raises ``RemoteProtocolError``: it is something else, or more, or less.
+    Trust: input from a peer that may write meanwhile, so each number is read once.
+    Raises ``RemoteProtocolError``: the area holds no packet within the limits.
     """
     count = _COUNT.unpack_from(memory)[0] if len(memory) >= _COUNT.size else 0
     if not 1 <= count <= min(limits.frames, len(memory) // _COUNT.size - 1):

@@ -1,11 +1,11 @@
-"""The fast lane's shared memory: where everything lies. Pure arithmetic; each side does its own.
+"""The layout of the fast lane's shared memory. Pure arithmetic: each side computes it for itself.
 
-Two slabs a shard. The *request* slab is written by the client and sealed against the jail's
-writes; the *reply* slab is written by the jail. Each starts with a header of 64-bit words, those
-that are polled on a cache line of their own. All shards share the *observation* slab, and write
-their rows of the batch in it; it holds one batch, or several in turn (slots), and one batch of
-rewards and flags. Arrays lie at 64-byte boundaries. The client never follows an offset or a
-length that it has not computed or bounded itself.
+Each shard has two slabs. The client writes the *request* slab, which is sealed against the jail's
+writes; the jail writes the *reply* slab. Each starts with a header of 64-bit words; polled words
+have a cache line of their own. All shards share the *observation* slab and write their rows of the
+batch there. It holds one batch, or several in turn (slots), and one batch of rewards and flags.
+Arrays lie at 64-byte boundaries. The client never follows an offset or a length that it has not
+computed or bounded itself.
 
 ::
 
@@ -13,15 +13,14 @@ length that it has not computed or bounded itself.
     reply         header | infos, encoded | the answer to a message, encoded
     observations  slot 0: one area per leaf | slot 1 ... | rewards, terminations, truncations
 
-``step`` goes this way, and messages that are small, both ways. Where spaces have no fixed layout,
-or the vector environment is the repository's own, a step is a message too: its actions lie where
-messages do, and its answer fills a slot of an observation slab that the shard has to itself.
+Steps travel in the slabs, and so do small messages in both directions. A step is a message, too, if
+the spaces have no fixed layout or the vector environment is the repository's own: its actions lie
+in the message area, and its answer fills a slot of an observation slab that belongs to one shard.
 
-Infos as columns: the same small dict every step, without a codec.
-
-When a step's infos are flat and numeric, both sides derive the same columns from the last infos
-that went *encoded*; as long as the next ones have that schema, only the numbers are written. No
-offset and no schema ever comes from the jail.
+Infos travel as columns, without the codec, while each step has the same small dict. If a step's
+infos are flat and numeric, both sides derive the same columns from the last *encoded* infos. As
+long as later infos have that schema, the jail writes only their numbers. Offsets and schemas never
+come from the jail.
 """
 
 from __future__ import annotations
@@ -80,7 +79,7 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a shard's actions lie in its request slab. Reply slabs are all alike: see ``words``.
+    """The layout of a shard's request slab. All reply slabs have one layout: see ``words``.
 
     Attributes:
         count: Sub-environments of the shard.
@@ -96,13 +95,13 @@ class Layout:
 
     @property
     def action_bytes(self) -> int:
-        """What one step sends."""
+        """The bytes that one step sends."""
         return _leaf_bytes(self.actions)
 
 
 @dataclass(frozen=True)
 class ObservationLayout:
-    """Where the observations of all shards lie: whole batches, one after the other.
+    """The layout of the observation slab of all shards: whole batches, one after the other.
 
     Attributes:
         count: Sub-environments of all shards together.
@@ -122,7 +121,7 @@ class ObservationLayout:
 
     @property
     def batch_bytes(self) -> int:
-        """What one step brings, but for infos."""
+        """The bytes of one step's results, without infos."""
         return _leaf_bytes(self.leaves) + self.count * _RESULT_BYTES
 
 
@@ -168,21 +167,23 @@ def message_layout(space: gym.Space[Any], count: int) -> Layout | None:
 def answer_bytes(space: gym.Space[Any], count: int) -> int:
     """The size of a slot for the answer to a step of ``count`` members of the space.
 
-    The observation may come twice, for ``final_obs``, and infos beside it. What takes more goes
-    over the server. Pages that are not written cost nothing.
+    It has room for the observation twice (``final_obs``) and for infos. A larger answer goes over
+    the server. Pages that are not written cost no memory.
     """
     return _paged(2 * _message_bytes(space, count) + count * _ENV_INFO_BYTES + INFO_BYTES)
 
 
 def _message_bytes(space: gym.Space[Any], count: int) -> int:
-    """Numbers may be wider than their space says; what has no fixed layout is not counted."""
+    """Estimates the bytes of ``count`` members, with numbers wider than declared; leaves without a
+    fixed layout count as nothing.
+    """
     leaves = [leaf for leaf in _leaves(space) if leaf is not None]
     wide = ((1 if dtype.itemsize == 1 else _ACTION_ITEM_BYTES, shape) for _, dtype, shape in leaves)
     return sum(_aligned(count * item_bytes * math.prod(shape)) for item_bytes, shape in wide)
 
 
 def _paged(size: int) -> int:
-    """Each slot of several is a map of its own in the client."""
+    """Rounds a slot's size up to whole pages: the client maps each of several slots on its own."""
     return -(-size // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
 
 
@@ -280,18 +281,20 @@ class Column:
     offset: int
 
     def view(self, buffer: Any, start: int) -> Any:
-        """Its place in a mapped slab whose info area is at ``start``.
+        """Returns the column as a view of a mapped slab whose info area is at ``start``.
 
-        Booleans are bytes there: a hostile byte of 2 would make a bool that is neither.
+        Booleans are read as bytes: a hostile byte of 2 would be a bool that is neither true nor
+        false.
         """
         dtype = np.dtype(np.uint8) if self.dtype.kind == "b" else self.dtype
         return np.ndarray(self.shape, dtype, buffer, start + self.offset)
 
 
 def own_infos(infos: dict[Any, Any]) -> list[dict[Any, Any]] | None:
-    """Each sub-environment's, of infos that are not joined; None where they are, or not alike.
+    """Returns each sub-environment's own infos; None if infos are joined or differ in form.
 
-    Alike are those of one each that have the same keys, in the same order, of the same classes.
+    Two infos have the same form if they have the same keys, in the same order, and their values
+    have the same classes.
     """
     places = infos.keys() - {batches.APART_SCALARS}
     if not places or places != set(range(len(places))):
@@ -304,9 +307,9 @@ def own_infos(infos: dict[Any, Any]) -> list[dict[Any, Any]] | None:
 
 
 def columns_of(infos: dict[Any, Any]) -> tuple[Column, ...] | None:
-    """The columns of flat, numeric infos in their order; None for any others.
+    """Returns the columns of flat, numeric infos in their order; None for other infos.
 
-    Of infos that are not joined, those of what joining makes of them.
+    Infos that are not joined get the columns of the joined infos.
     """
     columns: list[Column] = []
     own = own_infos(infos)

@@ -13,7 +13,7 @@ INFO_BYTES = 64 * 1024
 """Room for a step's infos, or for what it raised, or for a message or its answer. What is larger
 goes through the server."""
 
-# a word is 8 bytes, a line holds 8 of them
+# A word has 8 bytes, a cache line holds 8 words.
 SEQUENCE = 0
 """Counts requests, or replies; polled by the other side."""
 PARKED = 8
@@ -75,12 +75,12 @@ def words(buffer: Any) -> memoryview:
 
 
 def served(leaves: int, request_bytes: int, observation_bytes: int, message_bytes: int) -> bool:
-    """Whether a server makes slabs of these sizes for a runner, and takes its steps.
+    """Whether a server makes slabs of these sizes for a runner and takes its steps.
 
     Args:
-        leaves: Of the actions; what a client sends is its words, of which so many are dtypes, and
-            the actions.
-        message_bytes: What a message between client and runner may have.
+        leaves: Number of action leaves. A client sends the slab's words, which include one dtype
+            for each leaf, and the actions.
+        message_bytes: Maximum size of a message between client and runner.
     """
     least, most = HEADER_BYTES + INFO_BYTES, min(_MAX_SERVED_BYTES, message_bytes)
     return (

@@ -26,17 +26,17 @@ _SHOWN, _KEYS = 100, 20
 
 
 def even_bounds(count: int, parts: int) -> list[tuple[int, int]]:
-    """``count`` members over ``parts`` shards, as evenly as it goes: ``[(start, stop), ...]``."""
+    """Divides ``count`` members among ``parts`` shards evenly: ``[(start, stop), ...]``."""
     size, larger = divmod(count, parts)
     starts = [index * size + min(index, larger) for index in range(parts + 1)]
     return list(itertools.pairwise(starts))
 
 
 def is_batch(batched: gym.Space[Any], single: gym.Space[Any], count: int) -> bool:
-    """Whether a vector environment's space has the form of ``count`` members of the single one.
+    """Whether a vector environment's space has the form of ``count`` members of the single space.
 
-    Only arrays, in mappings and tuples of the same keys, can differ: for others it is True. Nothing
-    is allocated, since both may be a worker's.
+    Compares arrays in mappings and tuples of the same keys; other spaces count as True. Allocates
+    nothing, since both spaces may come from a worker.
     """
     if isinstance(single, ARRAY_SPACES):
         shape = (count, *(single.shape or ()))
@@ -74,7 +74,7 @@ def _item(index: Any, space: gym.Space[Any], batch: Any) -> Any:
 
 
 def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
-    """The slices of a batch. Arrays are views."""
+    """Cuts a batch into slices. Arrays are views."""
     if isinstance(space, ARRAY_SPACES):  # in each step of several workers
         return [batch[start:stop] for start, stop in bounds]
     return [_mapped(partial(_item, slice(*window)), space, batch) for window in bounds]
@@ -83,7 +83,7 @@ def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
 def members(
     space: gym.Space[Any], batched: gym.Space[Any], batch: Any, count: int
 ) -> Iterable[Any]:
-    """Gymnasium's ``iterate``, which finds no members where a mapping or a tuple is empty."""
+    """Iterates like Gymnasium's ``iterate``, which finds nothing in an empty mapping or tuple."""
     if _has_empty(space):
         return (_mapped(partial(_item, index), space, batch) for index in range(count))
     return iterate(batched, batch)
@@ -98,7 +98,7 @@ def _has_empty(space: gym.Space[Any]) -> bool:
 
 
 def reordered(space: gym.Space[Any], batch: Any, order: Sequence[int]) -> Any:
-    """The same members of a batch in another order; lists and tuples stay what they are."""
+    """Returns a batch's members in another order; lists stay lists and tuples stay tuples."""
     return _mapped(partial(_reordered, order), space, batch)
 
 
@@ -109,7 +109,7 @@ def _reordered(order: Sequence[int], space: gym.Space[Any], batch: Any) -> Any:
 
 
 def join(space: gym.Space[Any], parts: Sequence[Any]) -> Any:
-    """One batch out of the shards' slices, in order."""
+    """Joins the shards' slices, in order, into one batch."""
     if isinstance(space, ARRAY_SPACES):  # in each step of several workers
         return np.concatenate(parts)
     return _mapped(_joined, space, *parts)
@@ -124,7 +124,7 @@ def _joined(space: gym.Space[Any], *parts: Any) -> Any:
 def conforms(space: gym.Space[Any], batch: Any, count: int) -> bool:
     """Whether a batch of ``count`` members has the structure, shapes and dtypes of the space.
 
-    Values are not looked at: many environments leave their own bounds.
+    Values are not checked: many environments leave their own bounds.
     """
     if isinstance(space, ARRAY_SPACES):
         shape = (count, *(space.shape or ()))
@@ -143,7 +143,7 @@ def conforms(space: gym.Space[Any], batch: Any, count: int) -> bool:
 
 
 class Misfit(RemoteProtocolError):
-    """Shards' infos that are no parts of one mapping: they have to be joined one by one."""
+    """The shards' infos do not join as columns: each sub-environment's own infos are needed."""
 
 
 APART: dict[Any, Any] = {None: None}
@@ -151,7 +151,7 @@ APART: dict[Any, Any] = {None: None}
 
 
 def is_apart(infos: dict[Any, Any]) -> bool:
-    """Whether they are ``APART``. Trust: they may be anything."""
+    """Whether infos are marked ``APART``. Trust: the value may be anything."""
     return len(infos) == 1 and infos.get(None, APART) is None
 
 
@@ -164,7 +164,7 @@ APART_REWARD = -2
 
 
 def reward_misfit(reward: Any, index: int, shape: tuple[int, ...] = ()) -> str:
-    """The text of the error about a reward that no vector environment can have."""
+    """The error text for a reward that no vector environment can hold."""
     needed = f"numbers of shape {shape}, as its reward_space says" if shape else "one number each"
     return (
         f"step of sub-environment {index} returned {shown(reward)} as reward. A vector environment "
@@ -188,7 +188,7 @@ def shown(value: Any) -> str:
 
 
 def integers(space: gym.Space[Any], member: Any) -> list[bool]:
-    """Whether each discrete member of this member of the space is an integer of Python's."""
+    """Whether each discrete part of a member of the space is a Python ``int``."""
     if isinstance(space, spaces.Discrete):
         return [isinstance(member, int)]
     if isinstance(space, spaces.Dict):
@@ -201,7 +201,7 @@ def integers(space: gym.Space[Any], member: Any) -> list[bool]:
 
 
 def with_integers(space: gym.Space[Any], member: Any, which: Iterator[bool]) -> Any:
-    """The inverse of ``integers``: makes a discrete member a Python integer as ``which`` says."""
+    """The inverse of ``integers``: makes the discrete parts that ``which`` marks Python ``int``."""
 
     def restored(space: gym.Space[Any], member: Any) -> Any:
         return int(member) if isinstance(space, spaces.Discrete) and next(which, False) else member
@@ -212,16 +212,16 @@ def with_integers(space: gym.Space[Any], member: Any, which: Iterator[bool]) -> 
 def join_infos(
     parts: Sequence[dict[Any, Any]], sizes: Sequence[int], max_bytes: int | None = None
 ) -> dict[Any, Any]:
-    """The infos of all shards as ``VectorEnv._add_info`` would have built them in one go.
+    """Joins the infos of all shards as ``VectorEnv._add_info`` would have built them at once.
 
-    The first sub-environment that has a key decides about its dtype, and each shard has a first
-    one of its own. Where these agree the shards' arrays are parts of the whole.
+    The first sub-environment that has a key determines the column's dtype, and each shard has its
+    own first. If these dtypes agree, the shards' arrays are parts of the whole column.
 
     Args:
         max_bytes: How much larger than the parts the whole may be: one row makes a long column.
 
     Raises:
-        Misfit: They do not agree, or are not what infos look like; ask for each one's own.
+        Misfit: The dtypes differ, or the values are no infos; ask for each sub-environment's own.
     """
     joined: dict[Any, Any] = {}
     if not any(parts):
@@ -237,13 +237,13 @@ def join_infos(
 
 
 class _Room:
-    """What the columns of joined infos may take: see ``join_infos``."""
+    """The remaining bytes for columns of joined infos: see ``join_infos``."""
 
     def __init__(self, parts: Sequence[dict[Any, Any]], max_bytes: int | None) -> None:
         self._parts, self._max_bytes, self._taken, self._own = parts, max_bytes, 0, 0
 
     def take(self, value: Any, count: int) -> None:
-        """Before a column of such values is made."""
+        """Spends the bytes of a column before it is made."""
         self._taken += value.nbytes * count // len(value)
         most = self._max_bytes
         if most is not None and self._taken > most:
@@ -273,7 +273,7 @@ def _join_part(
         size = window.stop - window.start
         if len(value) != size:  # or its other dimensions cost nothing
             raise ValueError("an entry does not have one value per sub-environment")
-        # its mask came before it: see join_slice
+        # A mask in front of its column is the mark of join_slice.
         if value.dtype == object and f"_{key}" in passed and f"__{key}" not in part:
             raise ValueError("an entry is 0 where other shards may have None")
         array = joined.get(key)
@@ -288,11 +288,11 @@ def _join_part(
 def gather_infos(
     parts: Sequence[dict[Any, Any]], sizes: Sequence[int], max_bytes: int
 ) -> dict[Any, Any]:
-    """``join_infos`` in which no part changes what another has said.
+    """Like ``join_infos``, but no part converts another's values.
 
-    An entry whose dtype, shape or kind differs between parts is an object array of each
-    sub-environment's own, and so is one that would take more than ``max_bytes`` as a column.
-    Each part must be one that ``check_infos`` takes.
+    An entry becomes an object array of each sub-environment's own values if its dtype, shape or
+    kind differs between parts, or if its column would take more than ``max_bytes``.
+    Each part must have passed ``check_infos``.
     """
     joined: dict[Any, Any] = {}
     start, count = 0, sum(sizes)
@@ -303,7 +303,7 @@ def gather_infos(
 
 
 def check_infos(part: dict[Any, Any], size: int) -> None:
-    """Whether these are infos of so many sub-environments. Raises ``Misfit``."""
+    """Raises ``Misfit`` unless ``infos`` are infos of ``count`` sub-environments."""
     for value in part.values():
         if isinstance(value, dict):
             check_infos(value, size)
@@ -333,14 +333,14 @@ _NOTHING = np.full(1, None, dtype=object)
 
 
 def _is_like(column: Any, value: Any) -> bool:
-    """Whether these are arrays whose rows are of the same form."""
+    """Whether both are arrays with the same dtype and the same shape of a row."""
     if not isinstance(column, np.ndarray):
         return False
     return (column.dtype, column.shape[1:]) == (value.dtype, value.shape[1:])
 
 
 def _members(infos: dict[Any, Any], key: Any, count: int) -> Any:
-    """The value of an entry for each sub-environment: object ``(count,)``, None without one."""
+    """An entry's value for each sub-environment, object ``(count,)``; None if it has no value."""
     value: Any = infos.get(key)
     members = np.full(count, None, dtype=object)
     if value is None:
@@ -363,7 +363,7 @@ def _is_mask(name: Any, infos: dict[Any, Any]) -> bool:
 
 
 def _has(infos: dict[Any, Any], key: Any, index: int) -> bool:
-    """Whether a sub-environment set the entry. Trust: the value in the mask's place may be any."""
+    """Whether a sub-environment set the entry. Trust: the mask may be any value."""
     mask: Any = infos.get(f"_{key}")
     is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.ndim == 1
     return not is_mask or bool(mask[index])
@@ -388,8 +388,8 @@ _SAME = _SCALARS | {str, bytes, type(None), list, tuple, dict, np.ndarray, np.bo
 
 
 def forms_of(info: dict[Any, Any]) -> Forms:
-    """For each entry whose class the wire changes: its mask's name, whether its column is one of
-    objects, and the same of what it holds. A member of an ``IntEnum`` arrives as its number.
+    """For each entry whose class the wire changes: the name of its mask, whether its column has
+    dtype object, and the same for nested entries. An ``IntEnum``'s member arrives as its number.
     """
     forms: Forms = {}
     for key, value in info.items():
@@ -401,7 +401,7 @@ def forms_of(info: dict[Any, Any]) -> Forms:
 
 
 def are_forms(forms: Any) -> bool:
-    """Whether they are what ``forms_of`` makes. Trust: they may be anything."""
+    """Whether a value has the structure of ``forms_of``'s result. Trust: it may be anything."""
     return type(forms) is dict and all(
         type(form) is tuple and list(map(type, form)) == [str, bool, dict] and are_forms(form[2])
         for form in forms.values()
@@ -411,17 +411,17 @@ def are_forms(forms: Any) -> bool:
 def join_pairs(
     pairs: Pairs, count: int, max_bytes: int | None = None, forms: Sequence[Forms] = ()
 ) -> dict[Any, Any]:
-    """The infos of ``count`` sub-environments, as ``VectorEnv._add_info`` joins them.
+    """Joins the infos of ``count`` sub-environments like ``VectorEnv._add_info``.
 
     Args:
-        pairs: Each sub-environment's own.
+        pairs: Each sub-environment's index and its infos.
         count: Number of sub-environments.
-        max_bytes: What all columns together may take: a few bytes make a large column.
-        forms: Of each of the pairs, what ``forms_of`` says of it elsewhere.
+        max_bytes: Maximum size of all columns together: a few bytes make a large column.
+        forms: For each of the pairs, the result of ``forms_of`` in the process that sent it.
 
     Raises:
         Exception: Whatever Gymnasium would raise, with the key in front.
-        MessageTooLargeError: They take more than that.
+        MessageTooLargeError: The columns would take more than ``max_bytes``.
     """
     left = max_bytes
 
@@ -441,12 +441,12 @@ def join_pairs(
 
 
 def join_slice(pairs: Pairs, count: int) -> dict[Any, Any]:
-    """``join_pairs`` of some of the sub-environments.
+    """Joins the infos of a shard's sub-environments like ``join_pairs``.
 
-    Rows without an entry are 0 in the column of an array of objects without dimensions, and None
-    in other columns of objects. Rows of other shards decide which of the two it is, and
-    ``join_infos`` does not see them. So the mask of such a column is put before it, from which
-    ``join_infos`` knows to raise ``Misfit``.
+    In a column of objects a row without the entry is 0 if the first value is a zero-dimensional
+    object array, else None. Another shard's row may be the first, which this shard cannot see. It
+    therefore puts the mask of such a column before the column, and ``join_infos`` raises ``Misfit``
+    when it meets a mask in front.
     """
     zeros: list[Any] = []
 
@@ -479,7 +479,7 @@ def add_info(
     column: Column,
     forms: Forms = _NO_FORMS,
 ) -> dict[Any, Any]:
-    """``VectorEnv._add_info``, without its allocations."""
+    """Does what ``VectorEnv._add_info`` does, without its allocations."""
     for key, value in info.items():
         array: Any
         mask_key, is_object, inner = forms.get(key, _NO_FORM) if forms else _NO_FORM
@@ -508,7 +508,7 @@ def add_info(
 
 
 def blank_column(value: Any, count: int) -> Any:
-    """The array for a key that is seen first: its dtype is decided by this value."""
+    """Makes the array for a new key; this first value determines its dtype."""
     kind = type(value)
     if is_scalar(kind):
         return np.zeros(count, dtype=kind)
@@ -535,7 +535,7 @@ def restores(space: gym.Space[Any]) -> bool:
 
 
 def restore_batch(space: gym.Space[Any], batch: Any) -> Any:
-    """A batch that ``conforms``, with the classes that Gymnasium gives its members."""
+    """Gives the members of a batch that ``conforms`` the classes that Gymnasium gives them."""
     return _mapped(_restored, space, batch)
 
 
@@ -544,7 +544,7 @@ def _restored(space: gym.Space[Any], batch: Any) -> Any:
 
 
 def restore(space: Any, member: Any) -> Any:
-    """One member with the class that Gymnasium gives it. What does not fit stays as is."""
+    """Gives a member the class that Gymnasium gives it. A misfit stays as it is."""
     if isinstance(space, spaces.Dict) and isinstance(member, dict):
         subspaces = space.spaces
         return {

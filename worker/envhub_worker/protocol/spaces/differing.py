@@ -1,5 +1,5 @@
-"""What Gymnasium says where the spaces of a task's sub-environments differ: the same in one process
-and in many. Followed: ``SyncVectorEnv.__init__`` and ``AsyncVectorEnv._check_spaces`` of 1.4.
+"""Gymnasium's error for a task whose sub-environments have different spaces: the same text for one
+process and many. Followed: ``SyncVectorEnv.__init__`` and ``AsyncVectorEnv._check_spaces`` of 1.4.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ _INSTEAD = "If this is intentional, use `observation_mode='different'` instead."
 
 
 def differing(sync: bool, pairs: Sequence[Pair]) -> str:
-    """The text of its ``RuntimeError``; "" where all are as those of the first.
-    ``sync``: whether by ``SyncVectorEnv``.
+    """Returns the text of Gymnasium's ``RuntimeError``; "" if all spaces equal the first's.
+    ``sync``: whether ``SyncVectorEnv`` would raise it.
     """
     observation, action = pairs[0]
     if sync:

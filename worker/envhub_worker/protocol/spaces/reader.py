@@ -30,7 +30,7 @@ from envhub_worker.protocol.spaces.spaces import (
 
 # Children of one Dict, Tuple or OneOf; a batch of custom spaces is a Tuple of as many.
 MAX_CHILDREN = 65_536
-# Keys of one Dict. Keys that are no text can be made to collide.
+# Keys of one Dict. An attacker can make keys other than text collide.
 MAX_KEYS = 4096
 MAX_INT64 = 2**63 - 1
 
@@ -52,15 +52,15 @@ GeneratorMaker = Callable[[object], np.random.Generator]
 
 
 class SpaceReader:
-    """Builds spaces out of one budget of bytes, which is asked before anything is built.
+    """Builds spaces within one budget of bytes, which is charged before anything is built.
 
-    The budget covers what stays in memory of each space, and one sample of it. Boxes that are
-    described alike share their bounds and cost them once: the tasks of a suite mostly are.
+    The budget covers the memory of each space and of one sample. Boxes with equal descriptions
+    share their bounds and pay for them once: most tasks of a suite have equal spaces.
 
     Args:
         max_elements: The budget, in elements of a float32 Box, each ``ELEMENT_BYTES``.
-        check: Called before each space is built; raises what ends the reading.
-        generator: Makes a generator of a state, which it checks. Without it there may be none.
+        check: Called before each space is built; may raise to end the reading.
+        generator: Checks a state and makes a generator from it. Without it, states are refused.
     """
 
     __slots__ = ("_boxes", "_check", "_depth", "_generator", "_left", "_max_elements", "_twice")
@@ -78,7 +78,7 @@ class SpaceReader:
         self._depth, self._twice = 0, False
 
     def space(self, value: object) -> Space:
-        """The next space. Trust: input from the worker.
+        """Reads the next space. Trust: input from the worker.
 
         Raises:
             RemoteProtocolError: Malformed, contradictory, or over ``max_elements``.
@@ -98,7 +98,7 @@ class SpaceReader:
             raise RemoteProtocolError(text) from error
 
     def _start(self, space: Space, states: object, generator: GeneratorMaker) -> None:
-        """Give a space and its parts generators in the state of the worker's."""
+        """Give a space and its parts generators in the states of the worker's generators."""
         parts = list(seeded_nodes(space))
         if type(states) is not list or len(states) != len(parts):
             raise RemoteProtocolError("A space does not have one generator for each part.")
@@ -110,7 +110,7 @@ class SpaceReader:
                 part._np_random = generator(state)
 
     def read(self, value: object) -> Space:
-        """One space and all that is in it."""
+        """Reads one space and all spaces in it."""
         if self._check is not None:
             self._check()
         self.spend(SPACE_BYTES)
@@ -124,7 +124,7 @@ class SpaceReader:
         return build(self, *(value[name] for name in names))
 
     def child(self, value: object) -> Space:
-        """A space inside the one that is being read."""
+        """Reads one child of the current space."""
         if self._depth == MAX_SPACE_DEPTH:
             raise RemoteProtocolError(f"Spaces are nested deeper than {MAX_SPACE_DEPTH}.")
         self._depth += 1
@@ -133,13 +133,13 @@ class SpaceReader:
         return space
 
     def children(self, value: object) -> list[Space]:
-        """All spaces inside the one that is being read."""
+        """Reads all children of the current space."""
         if type(value) is not list or len(value) > MAX_CHILDREN:
             raise RemoteProtocolError("A space's parts are not a list of sane length.")
         return list(map(self.child, value))
 
     def child_twice(self, value: object) -> Space:
-        """A space of which Gymnasium keeps a batch of one besides; pays for both."""
+        """Reads a child of which Gymnasium also keeps a batch of one; pays for both."""
         before, within = self._left, self._twice
         self._twice = True  # that batch has bounds of its own
         space = self.child(value)
@@ -167,7 +167,7 @@ class SpaceReader:
         return value
 
     def like(self, key: tuple[object, ...]) -> spaces.Box | None:
-        """Another Box of the same description, which has the bounds of the first."""
+        """Makes another Box with the bounds of the first Box of the same description."""
         twin = None if self._twice else self._boxes.get(key)
         if twin is None:
             return None
@@ -176,7 +176,7 @@ class SpaceReader:
         return another
 
     def keep(self, key: tuple[object, ...], box: spaces.Box) -> None:
-        """Takes note of a Box, for those that are described alike."""
+        """Remembers a Box for later ones with the same description."""
         if not self._twice:
             self._boxes[key] = box
 
@@ -210,7 +210,7 @@ def _read_box(
     size = reader.shape(shape, 2 * dtype.itemsize + 2)
     bounds = [_expand(bound, size, dtype) for bound in (low, high)]
     masks = [_expand(mask, size, np.dtype(bool)) for mask in (below, above)]
-    # Says no to nan as well, which some versions of Gymnasium let pass.
+    # Refuses nan, too, which some versions of Gymnasium accept.
     if not (bounds[0] <= bounds[1]).all():
         raise RemoteProtocolError("A Box's low is not below its high.")
     box = spaces.Box(low=bounds[0], high=bounds[1], shape=size, dtype=dtype.type)
@@ -222,7 +222,7 @@ def _read_box(
 
 
 def _box_key(name: object, shape: object, *arrays: object) -> tuple[object, ...] | None:
-    """A cache key of all that a Box is made of; None if that is large or malformed."""
+    """A cache key of a Box's description; None if the description is large or malformed."""
     key: list[object] = [name]
     if not is_shape(shape):
         return None
@@ -249,7 +249,7 @@ def _read_multi_discrete(
     reader: SpaceReader, name: object, shape: object, nvec: object, start: object
 ) -> Space:
     dtype = _dtype(name, INTEGER_DTYPES)
-    # its bounds; a sample takes as much once more
+    # Pays for the bounds; a sample takes as many bytes again.
     size = reader.shape(shape, 4 * dtype.itemsize)
     counts, first = _expand(nvec, size, dtype), _expand(start, size, dtype)
     return spaces.MultiDiscrete(counts.copy(), dtype=dtype.type, start=first.copy())

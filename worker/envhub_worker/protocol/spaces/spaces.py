@@ -3,8 +3,8 @@
 Works with Gymnasium 0.26 to 1.4, which may differ between the two ends.
 
 A space that its author has seeded draws the same samples in each run, and so must its copy in the
-client: the states of its generators travel along. One that was not seeded starts anywhere: its
-state does not travel, for a remembered description would make every run start at the same place.
+client: the description includes the states of its generators. The state of an unseeded generator is
+left out: the client remembers descriptions, and every run would draw the same samples.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ OneOf: Any = getattr(spaces, "OneOf", None)
 class OpaqueSpace(gym.Space[Any]):
     """Stands for a space of the peer that Gymnasium does not know.
 
-    It can say what it is, be compared and batched, and nothing else.
+    It has a ``repr``, can be compared and batched, and supports nothing else.
 
     Attributes:
         type_name: Qualified class name of the peer's space.
@@ -132,24 +132,24 @@ BIT_GENERATORS = (
 
 
 def seeded_nodes(space: Space) -> Iterator[Space]:
-    """A space and all that it is made of, in a fixed order."""
+    """Returns a space and all spaces in it, in a fixed order."""
     yield space
     for child in _parts_of(space):
         yield from seeded_nodes(child)
 
 
 def seeded_states(space: Space, single: Space | None = None) -> States | None:
-    """What each node's generator is to begin with, None for those that were not seeded.
+    """Returns the initial generator state of each node, None for a node that was not seeded.
 
-    A number says that it is the very generator of an earlier node.
+    A number in place of a state means that the node shares the generator of that earlier node.
 
     Args:
         space: The space.
-        single: The one that it is a batch of, if it is. Gymnasium seeds copies of some spaces in a
-            batch, by chance where they were not seeded.
+        single: The space that ``space`` is a batch of, or None. Gymnasium seeds copies of some
+            spaces in a batch, at random if the single space is not seeded.
 
     Returns:
-        None if there is nothing to tell.
+        None if no node is seeded.
     """
     known = (*ARRAY_SPACES, spaces.Dict, spaces.Tuple)  # seeded in a batch only if they are
     for node in seeded_nodes(single) if single is not None else ():
@@ -159,7 +159,7 @@ def seeded_states(space: Space, single: Space | None = None) -> States | None:
     first: dict[int, int] = {}
     for index, node in enumerate(seeded_nodes(space)):
         state = _state(node)
-        # of one that several share: the index of the first
+        # For a shared generator: the index of the first node that has it.
         sharer = first.setdefault(id(getattr(node, "_np_random", None)), index)
         states.append(state if state is None or sharer == index else sharer)
     return states if any(state is not None for state in states) else None
@@ -178,13 +178,13 @@ def _parts_of(space: Space) -> tuple[Space, ...]:
 
 
 def entropy_of(bits: Any) -> Any:
-    """What a bit generator was seeded with; before numpy 1.25 the name was another."""
+    """The entropy that seeded a bit generator. The attribute has another name before numpy 1.25."""
     sequence = getattr(bits, "seed_seq", None) or getattr(bits, "_seed_seq", None)
     return getattr(sequence, "entropy", None)
 
 
 def _state(space: Space) -> Any:
-    """The state of a space's generator; None if it has none, or one that was seeded at random."""
+    """Returns a generator's state; None without a generator or if it was seeded at random."""
     generator = getattr(space, "_np_random", None)
     if type(generator) is not np.random.Generator:
         return None
@@ -207,8 +207,8 @@ def encode_space(
 
     Args:
         space: The space.
-        seeded: Whether the generators of seeded spaces are described, too.
-        single: The space that it is a batch of, if it is.
+        seeded: Whether to describe the generators of seeded spaces, too.
+        single: The space that ``space`` is a batch of, or None.
 
     Raises:
         LocalProtocolError: Spaces nested deeper than 12.
@@ -235,7 +235,8 @@ def _fields(space: Any, depth: int) -> tuple[Any, ...]:
 
 
 _opaque_fields = _fields.dispatch(object)
-# each class is named: to read it off the annotations takes as long as all else here
+# Each ``register`` below names its class: to read the classes from annotations would take as long
+# as the whole rest of this import.
 
 
 @_fields.register(OpaqueSpace)
