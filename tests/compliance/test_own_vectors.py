@@ -71,7 +71,11 @@ class Own(gym.vector.VectorEnv):
     def step(self, actions):
         n = self.num_envs
         results = {
-            "rewards": [None] * n if self.case == "rewards" else [0.5] * n,
+            "rewards": {
+                "none": [None] * n,
+                "masked": np.ma.masked_array(np.zeros(n)),
+                "words": np.array(["a"] * n),
+            }.get(self.case, [0.5] * n),
             "terminations": [False] * n,
             "truncations": [False] * n,
             "infos": "none" if self.case == "infos" else [{"i": i, "x": 0.5} for i in range(n)],
@@ -95,16 +99,17 @@ def test_lists_are_what_gymnasium_would_make_of_them(tmp_path: Path) -> None:
         assert infos["x"].tolist() == [0.5, 0.5]
 
 
-@pytest.mark.parametrize("case", ["rewards", "infos", "no info"])
+@pytest.mark.parametrize("case", ["none", "masked", "words", "infos", "no info"])
 def test_what_is_none_of_it_is_named(tmp_path: Path, case: str) -> None:
     """It is the repository's fault, not the wire's; the environment stays usable."""
     with make_env(write_repository(tmp_path, _OWN), n_envs=2, env_kwargs={"case": case}) as suites:
         env = suites.env
-        what = "in place of" if case == "no info" else case
+        what = {"no info": "in place of", "infos": "infos"}.get(case, "rewards")
         if case != "no info":
             env.reset()
         with pytest.raises(RemoteEnvError, match=f"make_env returned a VectorEnv .*Own.*{what}"):
             _ = env.reset() if case == "no info" else env.step([0, 1])
+        assert case in env.get_attr("case")
 
 
 _WRAPPED = """

@@ -126,7 +126,9 @@ def _column(env: Any, name: str, values: Any, dtype: Any) -> Any:
             values = np.empty(0, object)
     shape, count = getattr(values, "shape", None), env.num_envs
     kind = getattr(getattr(values, "dtype", None), "kind", "f")
-    if not shape or shape[0] != count or kind == "O":
+    # others arrive as texts: a masked array, and what is an array for numpy alone
+    is_sent = hasattr(type(values), "__dlpack__") and not hasattr(values, "mask")
+    if not shape or shape[0] != count or kind not in "biuf" or not is_sent:
         returned = f"{batches.shown(values)} as {name}"
         raise _misfit(env, "step", f"returns {returned}, which have to be one number each, {count}")
     return values
