@@ -292,7 +292,8 @@ class Jails:
         """The asker's living jail of this number. Raises the reply if there is none."""
         entry = self._found(asker.session, number)
         if entry is None:
-            raise RefusedError("WorkerDiedError", f"there is no jail {number}; it has been closed")
+            why = "it has been closed, or another task in it was given up, or the server is new"
+            raise RefusedError("WorkerDiedError", f"there is no jail {number}: {why}")
         if entry.death is not None:
             raise AnsweredError(m.replace(entry.death, operation=operation))
         return entry
