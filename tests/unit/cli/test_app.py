@@ -265,8 +265,7 @@ def test_a_wrapped_line_begins_no_command(
     with guarded():
         show_rows(rows)
     shown = capsys.readouterr().out
-    assert len(shown.splitlines()) == 2
-    assert obeyed(shown) == []
+    assert (len(shown.splitlines()), obeyed(shown)) == (2, [])
 
 
 def test_what_takes_long_has_lines_in_a_log(capfd: pytest.CaptureFixture[str]) -> None:

@@ -78,8 +78,7 @@ def test_an_empty_repository_and_pipes_are_no_error(tmp_path: Path, snapshot_sto
     (folder / "env.py").write_text("1")
     os.mkfifo(folder / "pipe")
     (folder / "empty").mkdir()
-    assert files(folder) == {"env.py": "1"}
-    assert left_out(folder) == []
+    assert (files(folder), left_out(folder)) == ({"env.py": "1"}, [])
 
 
 def test_files_that_git_does_not_look_at_are_named(repository: GitRepository) -> None:

@@ -27,8 +27,7 @@ def test_each_line_is_logged_and_shown(caplog: pytest.LogCaptureFixture) -> None
                 tell("installing")
         with log.progress_shown("org/repo") as tell:
             tell("for nobody")
-    assert inner[0] == "org/repo: resolving"
-    assert len(inner[1]) == 100
+    assert (inner[0], len(inner[1])) == ("org/repo: resolving", 100)
     assert outer == ["org/repo: installing"]
     assert len(caplog.messages) == 4
 

@@ -108,8 +108,7 @@ def test_who_has_answered_is_found_at_once(lanes: list[FakeLane]) -> None:
     """All of them, in order, also where the deadline has passed; nothing is listened to. A deadline
     ends the wait for others."""
     lanes[0].silent = lanes[2].silent = False
-    assert found(lanes, 0) == [0, 2]
-    assert found(lanes, None) == [0, 2]
+    assert (found(lanes, 0), found(lanes, None)) == ([0, 2], [0, 2])
     assert not any(lane.listened for lane in lanes)
     lanes[0].silent = lanes[2].silent = True
     assert found(lanes, 0.05) == []

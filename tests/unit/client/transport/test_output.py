@@ -52,8 +52,7 @@ def test_a_file_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         file(f"line {number}")
     sinks.close()
     lines = path.read_text().splitlines()
-    assert lines[:2] == ["before", "line 0"]
-    assert lines[-1] == "[the rest is left out]"
+    assert (lines[:2], lines[-1]) == (["before", "line 0"], "[the rest is left out]")
     assert path.stat().st_size < 150
 
 

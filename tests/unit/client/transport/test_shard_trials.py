@@ -134,8 +134,7 @@ def test_every_sub_environment_has_one_shard(count: int, cpus: int) -> None:
 )
 def test_a_damaged_file_is_as_none(path: Path, content: bytes) -> None:
     path.write_bytes(content)
-    assert use(path, {"8+8": 1e-3}) == "8+8"
-    assert use(path, {"10+6": 1e-3}) == "10+6"
+    assert (use(path, {"8+8": 1e-3}), use(path, {"10+6": 1e-3})) == ("8+8", "10+6")
 
 
 @pytest.mark.parametrize(

@@ -66,8 +66,7 @@ def order(**fields: Any) -> m.NeedPackages:
 
 def test_an_order_is_taken_as_plain_values() -> None:
     made = packages.checked(order(requirements=(("numpy", "env.py"),), python="3.11"))
-    assert made["requirements"] == [["numpy", "env.py"]]
-    assert made["python"] == "3.11"
+    assert (made["requirements"], made["python"]) == ([["numpy", "env.py"]], "3.11")
 
 
 @pytest.mark.parametrize(

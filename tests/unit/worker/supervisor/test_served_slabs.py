@@ -128,8 +128,7 @@ def test_a_runner_that_is_awake_is_not_rung(
 def test_a_server_sleeps_when_an_answer_takes_long(served: Served) -> None:
     """It looks once more soon, for the ring may cross with that; then it is rung."""
     taken = served.ask(spin_ns=1)
-    assert served.steps.look() == 2
-    assert served.runner.asked[words.PARKED] == 1
+    assert (served.steps.look(), served.runner.asked[words.PARKED]) == (2, 1)
     assert served.steps.look() is None
     served.runner.answer()
     assert select.select([served.steps.fileno()], [], [], 60)[0]

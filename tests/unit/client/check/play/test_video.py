@@ -188,8 +188,7 @@ def test_a_pixel_is_the_mean_of_those_that_it_stands_for() -> None:
     frame = np.zeros((4, 6, 3), np.uint8)
     frame[:2, :2, 1] = [[0, 100], [200, 255]]
     small = small_picture(frame, 3)
-    assert small.shape == (2, 3, 3)
-    assert small[0, 0].tolist() == [0, 139, 0]
+    assert (small.shape, small[0, 0].tolist()) == ((2, 3, 3), [0, 139, 0])
     assert not small[1:].any()
     assert small_picture(frame, 6) is frame, "nothing is enlarged"
 

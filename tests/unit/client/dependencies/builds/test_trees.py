@@ -39,8 +39,7 @@ def unpacked(archive: Path) -> Path:
 def test_the_files_of_a_source_distribution(tmp_path: Path) -> None:
     make_sdist(tmp_path, "x", files={"a/b.py": "1", "setup.py": "2"})
     top = unpacked(tmp_path / "x-1.0.tar.gz")
-    assert top.name == "x-1.0"
-    assert (top / "a/b.py").read_text() == "1"
+    assert (top.name, (top / "a/b.py").read_text()) == ("x-1.0", "1")
     assert stat.S_IMODE((top / "setup.py").stat().st_mode) == 0o644
 
 

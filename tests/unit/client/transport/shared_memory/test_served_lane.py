@@ -144,8 +144,7 @@ def test_columns_follow_their_schema() -> None:
     columns = np.array([7, 8, 9]).tobytes().ljust(64, b"\0") + b"\1\2\0"
     assert both.answer(slabs.COLUMNS, columns, length=0) == (slabs.COLUMNS, None)
     found = both.shard.columns()
-    assert found["a"].tolist() == [7, 8, 9]
-    assert found["_a"].tolist() == [True, True, False]
+    assert (found["a"].tolist(), found["_a"].tolist()) == ([7, 8, 9], [True, True, False])
     fresh = ServedShard(both.layout, both.observed)
     assert (both.shard.known > 0, fresh.known) == (True, 0)
     with pytest.raises(RemoteProtocolError, match="before their schema"):
@@ -309,8 +308,7 @@ def test_who_only_looks_has_infos_fetched_once() -> None:
     assert len(served.server.sent) == 2
     served.server.answer(INFOS)
     assert served.lane.answered()
-    assert served.reward() == 3
-    assert len(served.server.sent) == 2
+    assert (served.reward(), len(served.server.sent)) == (3, 2)
     assert served.step(), "it is as before"
     served.server.answer(slab(reward=4))
     assert served.lane.answered()

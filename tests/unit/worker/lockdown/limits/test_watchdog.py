@@ -351,9 +351,7 @@ def test_jail_environment_grants_by_name() -> None:
     """The caller's variables win over ours; the zygote's own thread limit does not pass."""
     base = zygote_environment({"LANG": "C"}, "/usr/bin/python3", {"PYTHONHASHSEED": "0"})
     built = jail_environment(base, {"TOKEN": "t", "MPLBACKEND": "svg"}, "/h", "/t")
-    assert built["TOKEN"] == "t"
-    assert built["MPLBACKEND"] == "svg"
-    assert built["HOME"] == "/h"
+    assert (built["TOKEN"], built["MPLBACKEND"], built["HOME"]) == ("t", "svg", "/h")
     assert built["TMPDIR"] == "/t"
     assert (built["LANG"], built["PYTHONHASHSEED"]) == ("C", "0")
     assert built["SDL_VIDEODRIVER"] == "dummy"
