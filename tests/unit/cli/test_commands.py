@@ -247,9 +247,7 @@ def looks() -> Iterator[Examine]:
         yield run
 
 
-def test_quotas_stand_beside_what_is_used(
-    looks: Examine, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_quotas_stand_beside_usage(looks: Examine, capsys: pytest.CaptureFixture[str]) -> None:
     assert looks(SAID) is Exit.OK
     text = capsys.readouterr().out
     rows = [line.split() for line in text.splitlines()]
@@ -287,9 +285,7 @@ def test_the_code_is_the_verdict(
     assert document["server"]["quotas"] == SAID["quotas"]
 
 
-def test_a_server_that_says_nothing_is_older(
-    looks: Examine, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_silent_server_is_older(looks: Examine, capsys: pytest.CaptureFixture[str]) -> None:
     """That is no reason to refuse it; and a hostile name is one line of text."""
     assert looks({}) is Exit.OK
     assert "older than this client" in capsys.readouterr().out

@@ -176,9 +176,7 @@ def test_each_change_is_told_as_what_it_is(tmp_path: Path) -> None:
         (f"{'a' * 240}/{'b' * 240}/{'c' * 40}.py", "eval(x)", "eval(y)"),
     ],
 )
-def test_what_cannot_be_held_against_a_line_is_new_in_a_changed_file(
-    name: str, then: str, now: str, tmp_path: Path
-) -> None:
+def test_what_has_no_line_is_new_if_changed(name: str, then: str, now: str, tmp_path: Path) -> None:
     """A pickle, code beyond what is read, a name too long to be printed; the control is no change,
     and a change of another file."""
     both = repository(tmp_path / "old"), repository(tmp_path / "new")
@@ -212,9 +210,7 @@ def test_a_folder_is_held_against_what_the_hub_has(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "code"), [([], 7), (["--fail-on", "note"], 1), (["--fail-on", "warning"], 0)]
 )
-def test_the_exit_code_says_whether_a_pin_may_move(
-    options: list[str], code: int, tmp_path: Path
-) -> None:
+def test_the_exit_code_says_if_pins_may_move(options: list[str], code: int, tmp_path: Path) -> None:
     """7 if anything differs; 1 only for a new finding, where that is asked for."""
     old, new = repository(tmp_path / "old"), repository(tmp_path / "new", "import pty\n" + _ENTRY)
     assert envhub("diff", old, new, *options).exit_code == code

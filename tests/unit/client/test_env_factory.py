@@ -105,9 +105,7 @@ def test_what_does_not_agree_leaves_no_jail(launcher: Launcher, server: LyingSer
 
 
 @pytest.mark.parametrize("lazy", [True, False])
-def test_a_suite_shares_a_jail_unless_it_is_lazy(
-    launcher: Launcher, server: LyingServer, lazy: bool
-) -> None:
+def test_all_but_lazy_share_a_jail(launcher: Launcher, server: LyingServer, lazy: bool) -> None:
     envs = tuple(env_manifest(task=task) for task in range(2))
     says(server, m.Load, m.LoadDone(encode_manifest(Manifest(envs=envs, lazy=lazy))))
     with suites(launcher) as made:

@@ -77,9 +77,7 @@ def test_what_cannot_be_is_refused(
     ("sandbox", "extra"),
     [("docker:python", "docker"), ("ray", "ray"), ("tcp://a:1", "remote"), (["process"], "fleet")],
 )
-def test_a_place_that_is_not_installed_is_named(
-    sandbox: Any, extra: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_absent_is_named(sandbox: Any, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """As where the package was installed without its module; with it, there is such a place."""
     lacking = f"envhub_sandbox.extras.{extra}"
     for name in [name for name in sys.modules if name.startswith(f"{lacking}.")]:
@@ -185,9 +183,7 @@ _GROUPS: dict[str, Any] = {"policy": Policy, "limits": Limits, "timeouts": Timeo
         ),
     ],
 )
-def test_each_place_has_its_spelling(
-    key: str, value: Any, python: str, command: str, lerobot: str
-) -> None:
+def test_spelling_of_places(key: str, value: Any, python: str, command: str, lerobot: str) -> None:
     assert option_name(key, value) == python
     with use_option_names(_ALL):
         assert option_name(key, value) == command

@@ -97,9 +97,7 @@ def test_no_input_of_the_action_is_a_script(hostile: str, checkout: Path, tmp_pa
     assert run(f"printf '<%s>\\n' {hostile}").stdout != f"<{hostile}>\n"
 
 
-def test_the_action_takes_a_weaker_profile_only_where_it_is_named(
-    checkout: Path, tmp_path: Path
-) -> None:
+def test_the_action_takes_a_weaker_profile_only_if_named(checkout: Path, tmp_path: Path) -> None:
     """And says why; the first of those that are named, and none where none can be had."""
     code, lines = judged(checkout, tmp_path, profile="strict no-userns")
     assert code == 0
@@ -132,9 +130,7 @@ def test_the_action_installs_itself(checkout: Path, tmp_path: Path) -> None:
         assert done.stdout.split() == [*venv, *pip, *locked, lock, *pip, *alone]
 
 
-def test_nothing_of_the_checkout_runs_while_envhub_is_installed(
-    checkout: Path, tmp_path: Path
-) -> None:
+def test_nothing_of_the_checkout_runs_in_an_installation(checkout: Path, tmp_path: Path) -> None:
     """Python's own ``-m`` looks in the current folder first; the control is a line without -I."""
     repository = tmp_path / "repository"
     write_repository(repository, "", **{f"{name}__py": "print('unjudged')" for name in _INSTALLERS})
@@ -295,9 +291,7 @@ def test_always(number): assert runs(f"always{number}") == 0
 
 
 @pytest.mark.parametrize(("others", "runs"), [(0, 4), (20, 1)])
-def test_what_failed_is_run_again_alone_three_times(
-    checkout: Path, tmp_path: Path, others: int, runs: int
-) -> None:
+def test_failures_run_alone_thrice(checkout: Path, tmp_path: Path, others: int, runs: int) -> None:
     """Attacks too; what fails once more fails the run, and more than twenty are not run again."""
     (tmp_path / "test_it.py").write_text(_FAILS % others)
     # only the plugin that is named: each of these processes would load all that are installed

@@ -63,9 +63,7 @@ WRONG: list[tuple[tuple[Any, ...], dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("values", "named"), CALLS)
-def test_fields_are_those_of_the_standard_library(
-    values: tuple[Any, ...], named: dict[str, Any]
-) -> None:
+def test_fields_are_the_standard_librarys(values: tuple[Any, ...], named: dict[str, Any]) -> None:
     ours, theirs = Ours(*values, **named), Theirs(*values, **named)
     assert dataclasses.asdict(ours) == dataclasses.asdict(theirs)
     assert repr(ours) == repr(theirs).replace("Theirs", "Ours")
@@ -74,9 +72,7 @@ def test_fields_are_those_of_the_standard_library(
 
 
 @pytest.mark.parametrize(("values", "named"), WRONG)
-def test_wrong_arguments_are_refused_where_the_standard_library_does(
-    values: tuple[Any, ...], named: dict[str, Any]
-) -> None:
+def test_wrong_arguments_are_refused_alike(values: tuple[Any, ...], named: dict[str, Any]) -> None:
     for kind in (Theirs, Ours):
         with pytest.raises(TypeError):
             kind(*values, **named)

@@ -111,9 +111,7 @@ def test_no_report_goes_where_a_link_of_the_judged_leads(tmp_path: Path) -> None
         settings.refuse_link_of_the_judged(path, reference)
 
 
-def test_where_it_lies_below_the_current_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_it_lies_below_this_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "here/a/b").mkdir(parents=True)
     (tmp_path / "here/a/b/env.py").touch()
     (tmp_path / "link").symlink_to(tmp_path / "here/a")

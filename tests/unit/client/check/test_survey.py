@@ -395,9 +395,7 @@ _RUNS = {
 
 
 @pytest.mark.parametrize("case", _RUNS)
-def test_code_in_another_encoding_is_reported(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_odd_encodings_are_told(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each imports a module that a reader does not see; the import itself is the control."""
     codecs.register(evil)
     try:

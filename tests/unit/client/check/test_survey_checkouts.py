@@ -86,9 +86,7 @@ def cloned_as_it_is(repository: GitRepository, folder: Path, name: str, text: st
     return folder / "clone"
 
 
-def test_what_a_checkout_turns_into_a_comment_is_reported(
-    repository: GitRepository, tmp_path: Path
-) -> None:
+def test_what_becomes_a_comment_is_reported(repository: GitRepository, tmp_path: Path) -> None:
     """Git writes the id of a file into it, over what stood there: in the commit that is code."""
     code = "#$Id:\rimport\tos\ros.popen('true')\r$\n"
     repository.commit({"odd.py": code, ".gitattributes": "*.py ident\n"})

@@ -183,9 +183,7 @@ made(Path(sys.argv[1]))
 
 
 @pytest.mark.parametrize("step", ["install", "publish"])
-def test_a_maker_that_is_killed_leaves_nothing_that_is_used(
-    index: Index, tmp_path: Path, step: str
-) -> None:
+def test_killed_makers_leave_nothing_that_is_used(index: Index, tmp_path: Path, step: str) -> None:
     """At each step: the next one takes away what is half-made, and makes it anew."""
     make_wheel(index.folder, "wanted")
     folder, reached = repository(tmp_path / "repo", "wanted"), tmp_path / "reached"
@@ -254,9 +252,7 @@ def test_one_that_is_used_stays_and_the_answer_names_its_user(index: Index, tmp_
     assert made(tmp_path / "repo").home == env.home
 
 
-def test_what_fails_between_choosing_and_installing_leaves_nothing(
-    index: Index, tmp_path: Path
-) -> None:
+def test_what_fails_after_choosing_leaves_nothing(index: Index, tmp_path: Path) -> None:
     wheel = make_wheel(index.folder, "wanted")
     folder = repository(tmp_path / "repo", "wanted")
     known(folder)
@@ -357,9 +353,7 @@ def test_what_is_announced_counts_before_it_is_there(tmp_path: Path) -> None:
         watch.look()
 
 
-def test_a_disk_that_fills_up_ends_it(
-    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_ends_it(index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """While packages come, and before they do: somebody else needs what is left."""
     make_wheel(index.folder, "wanted")
     folder = repository(tmp_path / "repo", "wanted")

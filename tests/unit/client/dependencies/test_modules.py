@@ -150,9 +150,7 @@ def test_a_jail_names_few_modules(tmp_path: Path) -> None:
     assert len(requirements(found)) == 5
 
 
-def test_a_release_that_took_names_away_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_took_names_away_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As it is loaded, and not in a later step; a repository of today, or of no day, gets no date,
     unlike one of years ago: there a package that raises for no reason may be too new."""
     found = snapshot(tmp_path / "r", MAKE)
@@ -200,9 +198,7 @@ def test_the_day_of_a_commit_is_asked_where_it_is_from(
         assert not [asked for asked in everybody.requests if "repo" in asked]
 
 
-def test_a_guess_never_stands_in_the_way(
-    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_guess_hinders(index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is declared comes without it; where nothing is declared, this interpreter serves."""
     monkeypatch.setattr(interpreters, "others", lambda declared, first: [])
     make_wheel(index.folder, "declared")
@@ -288,9 +284,7 @@ def request(name: str, **fields: Any) -> PackageRequest:
     return PackageRequest("requirements.txt", (wanted,), **fields)
 
 
-def test_another_release_is_tried_and_remembered(
-    tried: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_release_is_tried_and_kept(tried: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """The newest first, after our own; the next time it is known which."""
     stamps = {"/opt/3.98.0": [1, 1]}
     monkeypatch.setattr(*inside.TELLING_RELEASES_APART, lambda one: stamps.get(one.path, [0, 0]))
@@ -315,9 +309,7 @@ def test_all_that_were_tried_are_named(tried: list[str]) -> None:
 @pytest.mark.parametrize(
     ("name", "fields"), [("nowhere", {}), ("never", {"python": OURS.version[:4]})]
 )
-def test_no_other_release_is_tried_in_vain(
-    tried: list[str], name: str, fields: dict[str, Any]
-) -> None:
+def test_no_release_is_tried_in_vain(tried: list[str], name: str, fields: dict[str, Any]) -> None:
     """Where Python is not the matter, or the caller has chosen it."""
     with refused_dependency("resolution") as caught:
         resolutions.resolution_for(request(name, **fields))

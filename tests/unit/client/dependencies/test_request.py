@@ -111,9 +111,7 @@ def test_no_link_and_no_second_interpreter(
         ((f"numpy=={NUMPY} --hash=sha256:{'0' * 64}",), "", f"numpy=={NUMPY}"),
     ],
 )
-def test_what_is_here_is_not_installed_again(
-    lines: tuple[str, ...], python: str, unmet: str | None
-) -> None:
+def test_nothing_is_installed_twice(lines: tuple[str, ...], python: str, unmet: str | None) -> None:
     """By name and version, without importing any; not what has hashes, which nobody can compare."""
     assert interpreters.first_unmet(declares(*lines, python=python)) == unmet
 
@@ -124,9 +122,7 @@ def test_a_marker_that_says_nothing_is_left_to_uv(marker: str) -> None:
     assert str(interpreters.first_unmet(declares(f"numpy; {marker}"))).startswith("numpy; ")
 
 
-def test_a_python_that_was_built_from_a_checkout(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_python_built_from_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(platform, "python_version", lambda: "3.12.1+")
     assert interpreters.first_unmet(declares(python=">=3.12,<3.13")) is None
     assert interpreters.own().version == "3.12.1"
@@ -231,8 +227,6 @@ def test_a_missing_module_has_one_cure(
     ("requirements", "said"),
     [(None, "declares no packages"), ("-e .\n", "line 1 of requirements.txt")],
 )
-def test_what_declares_nothing_that_can_be_taken_is_told(
-    tmp_path: Path, requirements: str | None, said: str
-) -> None:
+def test_declaring_nothing_is_told(tmp_path: Path, requirements: str | None, said: str) -> None:
     found = snapshot(tmp_path, requirements)
     assert said in MissingModule(found, "docker", "auto", None, False).advice()

@@ -65,9 +65,7 @@ def built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Source]:
     return seen
 
 
-def test_a_source_is_chosen_and_built_by_none_but_the_builder(
-    index: Index, tmp_path: Path, built: list[Source]
-) -> None:
+def test_only_the_builder_takes_sources(index: Index, tmp_path: Path, built: list[Source]) -> None:
     """What its wheel needs is looked at then, and may be a source again; both are installed."""
     hashes = {
         name: source_distribution(index.folder, name, "1.5", tmp_path / "ran")
@@ -85,9 +83,7 @@ def test_a_source_is_chosen_and_built_by_none_but_the_builder(
     assert len(built) == again
 
 
-def test_what_is_named_beside_another_is_built_in_its_turn(
-    index: Index, tmp_path: Path, built: list[Source]
-) -> None:
+def test_what_is_named_is_built_in_turn(index: Index, tmp_path: Path, built: list[Source]) -> None:
     """uv names each package that lacks a wheel, also one of which only old releases do."""
     for name, version in (("half-source", "1.0"), ("half-source", "2.0"), ("deeper-source", "1.5")):
         source_distribution(index.folder, name, version, tmp_path / "ran")
@@ -216,9 +212,7 @@ def test_who_has_a_gpu_gets_cuda(gpu: bool, monkeypatch: pytest.MonkeyPatch) -> 
     assert resolve.without_cuda(replace(TORCH, gpu=gpu), lock, resolved) is lock
 
 
-def test_pytorchs_own_index_is_asked_only_by_who_has_chosen_none(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_pytorchs_index_is_asked_only_if_none_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     lock = CUDA
     without = Lock("torch==2.5+cpu \\\n    --hash=sha256:00\n")
     monkeypatch.delenv("UV_TORCH_BACKEND", raising=False)

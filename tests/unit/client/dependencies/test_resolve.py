@@ -222,9 +222,7 @@ def test_no_password_of_an_index_is_in_an_error(
     assert "hidden" not in f"{caught.value} {caplog.text}"
 
 
-def test_only_what_was_uploaded_before_a_date(
-    index: Index, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_uploads_before_a_date(index: Index, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the repository's packages; the worker's may be as new as it needs them, and no newer. A
     source has a day as a wheel has."""
     make_sdist(index.folder, "unbuilt")
@@ -356,9 +354,7 @@ def test_the_users_settings_are_uvs(given: dict[str, str], uvs: dict[str, str | 
     assert {name: found.get(name) for name in uvs} == uvs
 
 
-def test_a_relative_path_is_relative_to_the_users_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_path_starts_in_the_users_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, version in WORKERS.items():
         make_wheel(tmp_path, name, version)
     monkeypatch.chdir(tmp_path.parent)

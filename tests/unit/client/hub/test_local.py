@@ -77,9 +77,7 @@ def test_unchanged_content_is_the_same_snapshot(folder: Path) -> None:
         ),
     ],
 )
-def test_forms_of_a_local_reference(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, text: str, path: str
-) -> None:
+def test_local_forms(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str, path: str) -> None:
     monkeypatch.chdir(folder.parent)
     monkeypatch.setenv("HOME", str(folder.parent))
     snapshot = local(text.format(folder))
@@ -143,9 +141,7 @@ def test_every_file_counts_but_those_of_git(folder: Path) -> None:
         assert set(names(local(folder))) == hidden | {".gitignore", "env.py", "sub/other.py"}
 
 
-def test_a_virtual_environment_is_left_out_and_said(
-    folder: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_virtualenv_is_left_out_and_said(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Its interpreter is a link, which no file of the Hub is: nobody hides a folder by this."""
     (folder / ".venv/bin").mkdir(parents=True)
     (folder / ".venv/pyvenv.cfg").write_text("")
@@ -253,9 +249,7 @@ def test_bottomless_folder_is_refused(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["max_files", "max_bytes", "max_file_bytes"])
-def test_folder_over_a_limit_is_refused(
-    folder: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_folder_is_refused(folder: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A home folder that was given by mistake is not copied; the error says what counts."""
     (folder / "env.py").write_text("22")
     monkeypatch.setattr(module, "DEFAULT_LIMITS", SnapshotLimits(**{name: 1}))

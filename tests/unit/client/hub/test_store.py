@@ -77,9 +77,7 @@ def test_published_files_load(slot: store.Slot) -> None:
 
 
 @pytest.mark.parametrize("mask", [0o000, 0o077])
-def test_tree_is_read_only_and_readable_for_every_user(
-    snapshot_store: Path, slot: store.Slot, mask: int
-) -> None:
+def test_every_user_can_only_read_it(snapshot_store: Path, slot: store.Slot, mask: int) -> None:
     before = os.umask(mask)
     try:
         store.publish(slot, records(), write, {})
@@ -144,9 +142,7 @@ DAMAGE: dict[str, Damage] = {
     ],
     ids=range(10),
 )
-def test_damage_is_refused_with_the_command_that_repairs(
-    published: store.Slot, damage: Damage, said: str
-) -> None:
+def test_damage_is_refused_with_a_repair(published: store.Slot, damage: Damage, said: str) -> None:
     """Whatever was changed, nothing is returned, and the error's command makes room again. What was
     changed is not taken for half deleted, either: somebody shall look at it."""
     damage(published)
@@ -186,9 +182,7 @@ def test_what_is_half_deleted_is_made_again(published: store.Slot, damage: Damag
     assert not list(published.folder.glob(".building-*"))
 
 
-def test_touched_but_equal_file_is_hashed_once(
-    published: store.Slot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_equal_file_is_hashed_once(published: store.Slot, monkeypatch: pytest.MonkeyPatch) -> None:
     os.utime(published.tree / "env.py")
     hashed: list[str] = []
 
@@ -258,9 +252,7 @@ def test_second_builder_keeps_the_first_ones_copy(published: store.Slot) -> None
     assert [path.name for path in published.folder.iterdir()] == [COMMIT]
 
 
-def test_store_that_cannot_be_made_says_where(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failing_store_says_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "file" / "cache"))
     slot = store.Slot(store.folder_of("local"), COMMIT, "x")
@@ -268,9 +260,7 @@ def test_store_that_cannot_be_made_says_where(
         store.publish(slot, records(), write, {})
 
 
-def test_store_is_in_the_users_cache_unless_said_otherwise(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_store_is_in_the_users_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """$ENVHUB_CACHE moves the store; without it the platform's cache folder is used."""
     monkeypatch.setenv("ENVHUB_CACHE", "~/x")
     monkeypatch.setenv("HOME", str(tmp_path))

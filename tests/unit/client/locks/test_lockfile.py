@@ -271,9 +271,7 @@ def put(old: str, new: str) -> Callable[[str], str]:
         (lambda text: "", "not a lock file"),
     ],
 )
-def test_what_is_no_lock_of_ours_is_refused(
-    tmp_path: Path, change: Callable[[str], str], said: str
-) -> None:
+def test_no_other_lock_is_taken(tmp_path: Path, change: Callable[[str], str], said: str) -> None:
     """By what is wrong with it; nothing of it becomes an option, a path or a line for uv."""
     with pytest.raises(LockError, match=said):
         lockfile.read(spoiled(tmp_path, change))

@@ -98,9 +98,7 @@ BUSY = ServerBusyError("a: no room")
         (PolicyError("not permitted"), False),
     ],
 )
-def test_a_place_that_is_full_or_not_there_is_followed_by_the_next(
-    error: EnvHubError, elsewhere: bool
-) -> None:
+def test_a_full_or_absent_place_is_followed_by_another(error: EnvHubError, elsewhere: bool) -> None:
     """What would be the same elsewhere is not tried again, or is a mistake to be known."""
     assert may_go_elsewhere(error) is elsewhere
 

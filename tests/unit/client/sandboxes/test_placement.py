@@ -154,9 +154,7 @@ def test_a_place_is_asked_once_for_all_workers(rooms: dict[str, Room]) -> None:
     assert {vars(member.sandbox)["asked"] for member in placement.members()} == {1}
 
 
-def test_servers_that_do_not_answer_are_not_all_asked(
-    rooms: dict[str, Room], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_not_all_silent_are_asked(rooms: dict[str, Room], monkeypatch: pytest.MonkeyPatch) -> None:
     """A name of DNS may have thousands of addresses; each group of them costs a wait."""
     names = [f"far{number:03}" for number in range(100)]
     rooms |= dict.fromkeys(names, Room(answers=False, workers=0)) | {"far099": Room(workers=1)}

@@ -269,9 +269,7 @@ def test_many_at_once_share_the_idle_one(pool: Pool) -> None:
     assert not wrong
 
 
-def test_a_container_changes_hands_only_when_it_is_idle(
-    monkeypatch: pytest.MonkeyPatch, pool: Pool
-) -> None:
+def test_only_idle_containers_change_hands(monkeypatch: pytest.MonkeyPatch, pool: Pool) -> None:
     """Its memory is one ``make_env``'s; another policy, or another repository, has its own."""
     monkeypatch.setattr(*inside.CONTAINERS, pool)
     monkeypatch.setattr(*inside.CONTAINER_STARTS, lambda self: Server())
@@ -336,9 +334,7 @@ def test_it_lasts_from_the_first_jail_to_the_last_environment(
     assert taken.users() == 0
 
 
-def test_it_moves_on_from_a_server_that_has_died(
-    hold: ServerHold, use: Callable[[], ServerUse[Server]]
-) -> None:
+def test_it_leaves_a_dead_server(hold: ServerHold, use: Callable[[], ServerUse[Server]]) -> None:
     leave = hold.enter()
     dead = use()
     hold.keep(dead.server)
@@ -378,9 +374,7 @@ def test_an_interrupted_end_is_finished_by_the_next_leave(
     assert events[-1] == "empty"
 
 
-def test_each_end_is_waited_for_once_by_the_next_or_the_last(
-    hold: ServerHold, use: Callable[[], ServerUse[Server]]
-) -> None:
+def test_ends_are_waited_for_once(hold: ServerHold, use: Callable[[], ServerUse[Server]]) -> None:
     """Never more than one is left; one that the garbage collector adds meanwhile is not lost."""
     leave, further = hold.enter(), hold.enter()
     server = use().server

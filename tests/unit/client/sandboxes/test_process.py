@@ -149,9 +149,7 @@ def alive(root: Path, name: str) -> Path:
 locks: list[LifeLock] = []
 
 
-def test_a_containers_folder_is_left_behind_when_its_client_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_is_left_with_its_client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No process holds the lock of its client; without one nothing can be told. A name in a folder
     that everybody may write proves nothing: no link is followed."""
     elsewhere = tmp_path / "elsewhere"
@@ -201,9 +199,7 @@ def test_a_folder_without_a_word_is_left_behind_once_it_is_old(tmp_path: Path) -
     assert found(tmp_path) == {"envhub-empty000", "envhub-begun000"}
 
 
-def test_what_may_be_another_machines_is_removed_by_hand_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_others_are_removed_by_hand_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A start removes what this machine has left since it runs; ``gc`` finds the other, too."""
     boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     folder(tmp_path, "envhub-dead0000", {"alive": f"{boot} 7"})
@@ -215,9 +211,7 @@ def test_what_may_be_another_machines_is_removed_by_hand_only(
     assert [path.name for path in tmp_path.iterdir()] == ["envhub-another0"]
 
 
-def test_a_folder_for_sockets_has_a_short_path(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_path_for_sockets_is_short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     long = tmp_path / ("x" * 100)
     long.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(long))

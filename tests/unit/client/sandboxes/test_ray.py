@@ -51,9 +51,7 @@ def test_an_answer_that_is_none_is_refused(lie: Any) -> None:
         (7, "none of ours"),
     ],
 )
-def test_how_a_server_ended_is_a_text(
-    answer: Any, says: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_how_servers_ended_is_text(answer: Any, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the node says: it is short, does nothing to a terminal, and hides no other error."""
     ray = use(Ray(connected="a:1"), monkeypatch)
     placed = cluster.PlacedActor({})

@@ -284,9 +284,7 @@ def test_a_server_that_never_ends_is_given_up(server: LyingServer) -> None:
         client.close()
 
 
-def test_a_start_is_not_shorter_for_the_packages_of_a_new_server(
-    server: LyingServer, tmp_path: Path
-) -> None:
+def test_packages_of_a_new_server_shorten_no_start(server: LyingServer, tmp_path: Path) -> None:
     """Two polls take longer than the start may; its time counts from the fork of a jail."""
     half = packages("making")
     says(server, half, half, packages("made", "k1", **FACTS))

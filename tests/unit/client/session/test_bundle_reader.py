@@ -214,9 +214,7 @@ def test_what_a_replay_uses_is_told(tmp_path: Path) -> None:
         wishes(found)
 
 
-def test_a_bundle_is_ours_where_only_we_write(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bundle_is_ours_if_only_we_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the cache's folder of bundles; a folder that others may write there is anybody's."""
     monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path))
     folder = bundle(tmp_path / "crashes")

@@ -67,9 +67,7 @@ def test_a_worker_that_was_sent_nothing_falls_behind(
     assert states(session) == [State.READY, State.READY], "nothing was sent to anybody"
 
 
-def test_one_sub_environment_is_asked_of_its_worker_alone(
-    requests: FleetRequests, lanes: list[FakeLane]
-) -> None:
+def test_one_is_asked_of_its_worker_alone(requests: FleetRequests, lanes: list[FakeLane]) -> None:
     asked: list[int | None] = []
 
     def message(number: int, place: int | None) -> m.Message:
@@ -102,9 +100,7 @@ def received(flight: InFlight, min_ready: int = 1) -> list[int]:
     return found
 
 
-def test_a_torn_connection_is_refused_until_a_reset(
-    flight: InFlight, lanes: list[FakeLane]
-) -> None:
+def test_torn_connection_is_refused_until_a_reset(flight: InFlight, lanes: list[FakeLane]) -> None:
     """What the next message would be taken for is not known; nothing more is sent or taken."""
     send(flight, 0, 1)
     lanes[1].jail.client.torn = True

@@ -104,9 +104,7 @@ def test_a_jail_is_closed_once(launcher: Launcher, client: _Client, place: _Plac
     assert (len(loaded.jail.waits), place.released) == (1, 1)
 
 
-def test_an_interrupted_close_goes_on_over_another_connection(
-    launcher: Launcher, client: _Client, place: _Place
-) -> None:
+def test_an_interrupted_close_goes_on(launcher: Launcher, client: _Client, place: _Place) -> None:
     loaded = opened(launcher, client, place)
 
     def interrupted() -> Any:
@@ -271,9 +269,7 @@ def test_it_is_opened_once_and_ends_with_its_last_user(opener: Any) -> None:
 
 
 @pytest.mark.parametrize(("lives", "ended"), [(True, 1), (None, 1), (False, 0)])
-def test_a_worker_that_is_given_up_is_given_up_for_all(
-    opener: Any, lives: bool | None, ended: int
-) -> None:
+def test_who_is_given_up_is_given_up_for_all(opener: Any, lives: bool | None, ended: int) -> None:
     """They share its process; a jail of one's own is nobody else's. What is dead stays until the
     last has left it, for the server to say why.
     """

@@ -104,9 +104,7 @@ def test_a_jail_is_taken_built_in_and_given_back_once(taken: tuple[Lease, _Jails
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), WorkerDiedError("it died")])
-def test_what_cannot_be_built_is_given_back(
-    taken: tuple[Lease, _Jails], error: BaseException
-) -> None:
+def test_what_is_not_built_is_given_back(taken: tuple[Lease, _Jails], error: BaseException) -> None:
     lease, jails = taken
     jails.fails["build"] = [error]
     with pytest.raises(type(error)):

@@ -86,9 +86,7 @@ def test_a_runners_word_is_no_death() -> None:
         (m.RelayDonePartly((2, 0), (1,)), (m.Value(7), DIED)),
     ],
 )
-def test_deaths_that_do_not_add_up_are_refused(
-    reply: m.RelayDonePartly, parts: tuple[m.Message, ...]
-) -> None:
+def test_false_deaths_are_refused(reply: m.RelayDonePartly, parts: tuple[m.Message, ...]) -> None:
     """Nobody dead, nobody asked, no ``Death``, frames too many or too few."""
     said = jail(reply, *parts)
     with pytest.raises(RemoteProtocolError):

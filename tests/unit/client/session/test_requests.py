@@ -71,9 +71,7 @@ def test_what_is_sent_instead_is_not_what_is_kept(session: EnvSession, lane: Fak
     assert recorded(session) == [m.Render(lane.number)]
 
 
-def test_another_message_than_was_asked_for_gives_the_worker_up(
-    session: EnvSession, lane: FakeLane
-) -> None:
+def test_a_wrong_message_gives_the_worker_up(session: EnvSession, lane: FakeLane) -> None:
     for lane.answer in (m.Value(1), m.Method()):
         assert session.requests.ask_own("name", m.GetOwn, "name") == lane.answer
     lane.answer = m.ResetDone(0, {})
@@ -109,9 +107,7 @@ def test_the_order_is_gymnasiums(session: EnvSession) -> None:
         requests.ask("render", render)
 
 
-def test_a_close_from_a_signal_handler_in_a_wait_says_closed(
-    session: EnvSession, lane: FakeLane
-) -> None:
+def test_a_close_by_a_signal_in_a_wait_says_closed(session: EnvSession, lane: FakeLane) -> None:
     """Whatever the wait ended in; and nothing of the environment is left."""
 
     def closing(deadline: object) -> Any:

@@ -47,9 +47,7 @@ def test_what_is_committed_counts_wherever_it_lies(repository: GitRepository) ->
     assert left_out(repository.folder) == []
 
 
-def test_what_git_ignores_is_left_out_unless_it_is_committed(
-    repository: GitRepository, tmp_path: Path
-) -> None:
+def test_of_ignored_files_committed_ones_count(repository: GitRepository, tmp_path: Path) -> None:
     """Also what only its user ignores, here; what git was made to add counts all the same. What was
     deleted counts no more, and a worktree, whose ``.git`` is a file, is as good."""
     folder = repository.folder
@@ -115,9 +113,7 @@ def test_a_link_is_a_file_with_its_text(repository: GitRepository) -> None:
     assert links.items() <= files(repository.folder).items()
 
 
-def test_a_virtual_environment_is_left_out_unless_it_is_committed(
-    repository: GitRepository,
-) -> None:
+def test_a_virtual_environment_is_left_out_unless_committed(repository: GitRepository) -> None:
     """Who made one here forgot to have git ignore it; a commit may hold what it likes."""
     (repository.folder / "mine/bin").mkdir(parents=True)
     (repository.folder / "mine/pyvenv.cfg").write_text("")
@@ -176,9 +172,7 @@ def test_a_folder_in_a_checkout_is_a_part_of_it(repository: GitRepository) -> No
     assert set(files(repository.folder / "build")) == {"env.py", "b.log"}
 
 
-def test_of_a_checkout_with_other_hashes_everything_counts(
-    tmp_path: Path, snapshot_store: Path
-) -> None:
+def test_with_other_hashes_everything_counts(tmp_path: Path, snapshot_store: Path) -> None:
     """Git would read its index wrongly, without an error, and no Hub has such ids."""
     folder = tmp_path / "sha256"
     subprocess.run(["git", "init", "--quiet", "--object-format=sha256", folder], check=True)
@@ -200,9 +194,7 @@ SPOIL: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("spoil", SPOIL)
-def test_without_a_checkout_that_git_can_read_everything_counts(
-    repository: GitRepository, spoil: str
-) -> None:
+def test_where_git_reads_nothing_everything_counts(repository: GitRepository, spoil: str) -> None:
     """What names itself ``.git`` hides nothing."""
     repository.commit({".gitignore": "*.pyc\n"})
     (repository.folder / "a.pyc").write_text("payload")

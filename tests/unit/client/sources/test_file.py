@@ -56,9 +56,7 @@ def shown(reference: object) -> set[str]:
         ("import importlib\nimportlib.import_module('/etc/a\\0')", "a.py etc/a.py", ""),
     ],
 )
-def test_its_modules_and_packages_are_its_own(
-    folder: Path, code: str, there: str, own: str
-) -> None:
+def test_its_modules_are_its_own(folder: Path, code: str, there: str, own: str) -> None:
     write(folder, *there.split(), **{"env.py": code})
     assert shown(folder / "env.py") == {"env.py", *own.split()}
 
@@ -163,9 +161,7 @@ def test_other_names_are_no_keys(name: str) -> None:
 
 
 @pytest.mark.parametrize("up", [".", "..", "/"])
-def test_a_home_directory_is_refused(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, up: str
-) -> None:
+def test_a_home_folder_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch, up: str) -> None:
     """So is a folder with it in it; a file there, or a folder below, is none."""
     monkeypatch.setenv("HOME", str(folder))
     with pytest.raises(PolicyError, match=r"is a home directory.*allow_secrets=True"):

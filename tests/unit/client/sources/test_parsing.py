@@ -134,9 +134,7 @@ def test_a_file_that_costs_too_much_is_not_read(
     assert parsing.parsed(texts) == {**read, "second.py": None}
 
 
-def test_children_that_are_lost_are_counted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lost_children_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ended = weaker(
         tmp_path, ("\n        tree = ", "\n        signal.raise_signal(9)\n        tree = ")
     )

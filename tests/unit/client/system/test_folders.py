@@ -54,9 +54,7 @@ def test_modes_do_not_follow_the_umask(tmp_path: Path, mask: int) -> None:
     assert [mode(tmp_path / name) for name in ("c/file", "cache/manifests/key")] == [0o600] * 2
 
 
-def test_nobody_gets_into_a_folder_before_it_has_its_mode(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nobody_gets_in_before_the_mode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before: list[int] = []
     monkeypatch.setattr(os, "chmod", lambda path, _: before.append(mode(Path(path))))
     with umask(0):

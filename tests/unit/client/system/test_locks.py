@@ -46,9 +46,7 @@ def test_a_lock_is_held_until_its_context_ends(tmp_path: Path) -> None:
     assert not (tmp_path / "record").exists(), "no file is made, and none is needed"
 
 
-def test_the_lock_of_a_file_that_was_replaced_is_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lock_of_a_replaced_file_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever comes next would have one as well: of the file that has the name now."""
     path, taken = tmp_path / "lock", []
 

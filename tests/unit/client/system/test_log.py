@@ -33,9 +33,7 @@ def test_each_line_is_logged_and_shown(caplog: pytest.LogCaptureFixture) -> None
 
 
 @pytest.mark.parametrize("variables", [{}, {"CI": "1"}])
-def test_only_a_terminal_is_written_to(
-    variables: dict[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_terminals_alone_get_it(variables: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     class Terminal(io.StringIO):
         def isatty(self) -> bool:
             return bool(variables)

@@ -86,9 +86,7 @@ def test_one_core_is_the_clients(monkeypatch: pytest.MonkeyPatch, shards: int) -
 
 
 @pytest.mark.parametrize("count", [1, 4])
-def test_a_program_may_keep_to_fewer_cores_after_its_imports(
-    monkeypatch: pytest.MonkeyPatch, count: int
-) -> None:
+def test_a_program_may_have_fewer_cores_later(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
     """As a trainer does with each of its processes: an environment uses those that there are."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(count)))
     assert Cores(9).awake == count - 1

@@ -66,9 +66,7 @@ def test_a_file_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     limit=st.integers(1, 20),
     asks=st.sets(st.integers(0, 12)),
 )
-def test_a_follower_gets_every_byte_that_is_kept(
-    prints: list[int], limit: int, asks: set[int]
-) -> None:
+def test_a_follower_gets_every_kept_byte(prints: list[int], limit: int, asks: set[int]) -> None:
     """Each once, in order; what it misses is the bytes that were dropped, and it can tell."""
     reads, writes = os.pipe2(os.O_NONBLOCK)
     tail = OutputTail(reads, limit)

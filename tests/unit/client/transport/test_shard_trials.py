@@ -51,16 +51,12 @@ def use(path: Path, times: Mapping[str, float], count: int = 16) -> str:
         ({"8+8": 90e-6, "10+6": 100e-6, "16": 95e-6}, "8+8"),
     ],
 )
-def test_the_fastest_of_all_that_were_tried_is_used(
-    path: Path, times: dict[str, float], expected: str
-) -> None:
+def test_the_fastest_of_all_is_used(path: Path, times: dict[str, float], expected: str) -> None:
     assert [use(path, times) for _ in range(3)] == list(times)
     assert {use(path, times) for _ in range(5)} == {expected}
 
 
-def test_where_half_as_many_are_slower_fewer_are_not_tried(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_fewer_are_not_tried_if_half_is_slower(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A use that is many times as slow would be a high price for what is known already."""
     cores(monkeypatch, 8)
     tried = ["1+1+1+1+1+1+1+1", "2+1+1+1+1+1+1", "2+2+2+2"]
@@ -88,9 +84,7 @@ def test_what_was_far_slower_is_not_tried_again(path: Path) -> None:
     assert [use(path, slower, 4) for _ in range(4)] == ["2+2", "3+1", "2+2", "2+2"]
 
 
-def test_another_number_of_cores_is_another_machine(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_cores_are_another_machine(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for _ in range(3):
         use(path, {"8+8": 2e-4, "10+6": 2e-4, "16": 1e-4})
     cores(monkeypatch, 4)
@@ -144,9 +138,7 @@ def test_a_damaged_file_is_as_none(path: Path, content: bytes) -> None:
         *((environment(16, sync=True), 1e-3), (environment(1), 1e-3)),
     ],
 )
-def test_what_is_no_time_or_no_choice_is_not_remembered(
-    path: Path, env: Any, step_s: float
-) -> None:
+def test_what_is_no_time_or_choice_is_not_remembered(path: Path, env: Any, step_s: float) -> None:
     """A clock may be strange; a cache that is not there or cannot be written is no error."""
     ShardTrials(path).note(env, [(0, env.num_envs)], step_s)
     assert not path.exists()

@@ -55,9 +55,7 @@ def test_a_server_that_restarts_is_waited_for() -> None:
 
 
 @pytest.mark.parametrize("keys", [True, False])
-def test_one_that_ends_every_handshake_is_refused(
-    keys: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_ends_every_handshake_is_refused(keys: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*inside.CUT_S, 0.3)
     far = TcpServer(_PUBLIC, z85.decode(_SECRET)) if keys else TcpServer(None, None)
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -113,9 +111,7 @@ def test_what_happens_to_a_connection_that_nobody_uses_is_read() -> None:
             assert not inside.link_is_up(used)
 
 
-def test_what_was_read_of_a_refusal_is_raised_by_the_next_use(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_was_read_of_a_refusal_is_raised_next(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*inside.CUT_S, 0.0)
     far = TcpServer(None, None)
     with (

@@ -170,9 +170,7 @@ def test_what_the_filters_raise_leaves_the_rest() -> None:
     assert two.message.text == "two"
 
 
-def test_a_torch_that_cannot_be_imported_is_not_the_workers_fault(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_broken_torch_is_no_workers_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torch = pytest.importorskip("torch")
     frames = m.pack(m.Value(torch.zeros(2)))
     (tmp_path / "torch.py").write_text("raise RuntimeError('another numpy')")

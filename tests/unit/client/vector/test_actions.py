@@ -37,9 +37,7 @@ SINGLE_SPACES: dict[str, gym.Space[Any]] = {
 
 
 @given(st.sampled_from(sorted(SINGLE_SPACES)), st.integers(1, 4), st.integers(0, 2**31))
-def test_samples_of_the_batched_space_are_taken_as_they_are(
-    name: str, count: int, seed: int
-) -> None:
+def test_samples_of_the_batched_space_stay_as_they_are(name: str, count: int, seed: int) -> None:
     """``env.action_space.sample()`` is always a batch."""
     space = SINGLE_SPACES[name]
     batched = batch_space(space, count)
@@ -65,9 +63,7 @@ def test_samples_of_the_batched_space_are_taken_as_they_are(
         (TUPLE, [[0, 1], {"x": np.zeros((2, 2))}], ([0, 1], {"x": np.zeros((2, 2))})),
     ],
 )
-def test_lists_tuples_and_other_dtypes_are_taken(
-    space: gym.Space[Any], value: Any, expected: Any
-) -> None:
+def test_lists_and_other_dtypes_are_taken(space: gym.Space[Any], value: Any, expected: Any) -> None:
     """Dtypes stay as they are: that is what an environment in this process would see."""
     assert_same(expected, batch_of(space, value, 2))
     mapping = types.MappingProxyType({"grip": [0, 1], "move": np.zeros((2, 2)), "more": 1})
@@ -109,9 +105,7 @@ def test_tensors_are_taken() -> None:
         (TEXT, 5, "expected 2 members of .*, got builtins.int"),
     ],
 )
-def test_other_shapes_dtypes_and_structures_are_refused(
-    space: gym.Space[Any], value: Any, complaint: str
-) -> None:
+def test_what_does_not_fit_is_refused(space: gym.Space[Any], value: Any, complaint: str) -> None:
     with pytest.raises(ActionError, match=complaint) as caught:
         batch_of(space, value, 2)
     assert isinstance(caught.value, ValueError)

@@ -156,9 +156,7 @@ def test_results_that_are_of_nobody_break_the_rules(lies: Any) -> None:
 
 
 @pytest.mark.parametrize(("found", "seed"), [(None, -1), ((None,), -1), ((3,), 3), (3, 3)])
-def test_a_seed_that_nobody_knows_is_minus_one(
-    monkeypatch: pytest.MonkeyPatch, found: Any, seed: int
-) -> None:
+def test_unknown_seed_is_minus_one(monkeypatch: pytest.MonkeyPatch, found: Any, seed: int) -> None:
     """As ``gymnasium.Env`` has it."""
     monkeypatch.setattr(_Liar, "np_random_seed", found)
     assert SingleEnv(_Liar()).np_random_seed == seed

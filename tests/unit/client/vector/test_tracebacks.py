@@ -82,9 +82,7 @@ def test_what_may_be_our_fault_keeps_its_frames(error: BaseException) -> None:
     assert (ask.__name__, ask.__doc__) == ("ask", "As a method of ours."), "it keeps its face"
 
 
-def test_the_log_has_them_once(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_logged_once(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     """At DEBUG, however many methods of ours it comes through; a variable shows them all."""
     with caplog.at_level(logging.DEBUG, "envhub_sandbox.errors"):
         frames(LoadError("no"), ask_by_another)

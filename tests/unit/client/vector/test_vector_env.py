@@ -38,9 +38,7 @@ from tests.support.in_process.interrupts import before_line
     ids=["reset", "render", "call", "set_attr", "step"],
 )
 @pytest.mark.parametrize("module", [vector_env, requests])
-def test_an_interrupted_request_leaves_no_wait_that_nobody_can_end(
-    module: ModuleType, act: Callable[[Any], object]
-) -> None:
+def test_interrupts_leave_no_endless_wait(module: ModuleType, act: Callable[[Any], object]) -> None:
     """A reset brings the environment back, wherever it was, and takes no other's answer."""
     line = 0
     while True:

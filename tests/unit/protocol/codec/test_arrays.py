@@ -178,9 +178,7 @@ FRAMED = descriptor(F4, 1, frame=True)
         (descriptor(BOOL, 2000), bytes(1999) + b"\xff", ()),
     ],
 )
-def test_a_lie_about_an_array_is_refused(
-    spoiled: bytes, tail: bytes, frames: tuple[bytes, ...]
-) -> None:
+def test_a_lying_array_is_refused(spoiled: bytes, tail: bytes, frames: tuple[bytes, ...]) -> None:
     with pytest.raises(RemoteProtocolError):
         read(spoiled, tail, frames)
 

@@ -35,9 +35,7 @@ def joined(infos: list[dict[str, Any]]) -> dict[Any, Any]:
 
 
 @given(st.lists(INFO, min_size=1, max_size=6), st.data())
-def test_what_goes_together_is_joined_as_ever(
-    infos: list[dict[str, Any]], data: st.DataObject
-) -> None:
+def test_what_fits_is_joined_as_ever(infos: list[dict[str, Any]], data: st.DataObject) -> None:
     parts = cut(infos, data)
     sizes = [len(part) for part in parts]
     with warnings.catch_warnings():

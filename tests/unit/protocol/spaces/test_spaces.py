@@ -337,9 +337,7 @@ def test_depth_is_bounded_on_both_sides() -> None:
     ],
     ids=repr,
 )
-def test_bytes_of_all_spaces_together_are_counted(
-    space: Space, spaces_in_it: int, more: int
-) -> None:
+def test_bytes_of_all_spaces_are_counted(space: Space, spaces_in_it: int, more: int) -> None:
     """``max_elements`` is exact: all that is built counts, and what is alike counts once."""
     elements = -(-(spaces_in_it * SPACE_BYTES + more) // ELEMENT_BYTES)
     assert decode_space(encode_space(space), max_elements=elements) == space

@@ -32,9 +32,7 @@ def test_sizes_have_units(text: str, size: int | None) -> None:
 
 
 @pytest.mark.parametrize("text", ["16X", "much", "0", "-1G", ""])
-def test_what_is_no_size_is_told_with_the_units(
-    text: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_size_is_told_with_units(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         parsed(f"--max-memory={text}")
     said = capsys.readouterr().err
@@ -90,9 +88,7 @@ def test_a_container_without_landlock_permits_no_weak_profile_by_itself(
     assert ("no jail can be opened" in identity.unusable("container", default)) is (abi == 0)
 
 
-def test_without_landlock_a_weak_profile_is_for_one_client(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_weak_profile_is_for_one_client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At the start, and when the list grows later; with Landlock it may be as long as it likes."""
     one, other = key_text(keys.generate().public), key_text(keys.generate().public)
     path = tmp_path / "clients"

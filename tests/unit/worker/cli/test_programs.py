@@ -31,17 +31,13 @@ def test_a_key_pair_is_written_once(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert parse_key(secret.read_text()) != parse_key(public.read_text())
 
 
-def test_a_folder_that_cannot_be_written_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unwritable_folder_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").touch()
     assert keygen.run(parsed(keygen, "--out", str(tmp_path / "file" / "below"))) == 1
     assert "envhub-worker keygen: " in capsys.readouterr().err
 
 
-def test_where_no_server_listens_there_is_nothing_to_drain(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_server_nothing_drains(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert drain.run(parsed(drain, "--state-dir", str(tmp_path), "--no-wait")) == 1
     assert capsys.readouterr().err.startswith("envhub-worker drain: ")
 
@@ -54,9 +50,7 @@ def test_where_no_server_listens_there_is_nothing_to_drain(
         ("frobnicate", "invalid choice: 'frobnicate'"),
     ],
 )
-def test_a_command_that_is_misspelt_is_told(
-    typed: str, says: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_misspelt_words_are_told(typed: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main([typed])
     assert says in capsys.readouterr().err

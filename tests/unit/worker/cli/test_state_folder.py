@@ -32,9 +32,7 @@ def test_it_is_there_as_long_as_its_server(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_that_of_a_server_that_was_killed_is_none(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_that_of_killed_servers_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """``status`` says at once that nobody is there, ``health`` looks on, ``listen`` replaces it."""
     tmp_path.chmod(0o700)
     worker = Path(state_folder.__file__).parents[2]
@@ -59,9 +57,7 @@ def test_a_server_removes_its_own(tmp_path: Path) -> None:
     assert state_folder.read_note(tmp_path) is None
 
 
-def test_a_state_folder_of_somebody_else_is_not_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_others_state_folders_are_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The temporary folder is everybody's: what others may write there is none of ours. Jails are
     made elsewhere: a relative folder is where one stands."""
     monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
@@ -79,9 +75,7 @@ def test_a_state_folder_of_somebody_else_is_not_used(
     assert state_folder.state_dir(Path("here"), create=True) == tmp_path / "here"
 
 
-def test_keys_are_kept_where_others_can_change_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_keys_are_kept_where_only_we_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     chosen = tmp_path / "chosen"
     chosen.mkdir(mode=0o700)
     assert state_folder.state_dir(chosen, create=True) == chosen

@@ -165,9 +165,7 @@ def test_landlock_write_includes_neither_devices_nor_more_than_abi_one_to_five()
 
 @pytest.mark.parametrize("namespaced", [True, False])
 @pytest.mark.parametrize("gpu", [False, (0,)])
-def test_landlock_permits_writing_in_the_scratch_alone(
-    gpu: bool | tuple[int, ...], namespaced: bool
-) -> None:
+def test_only_the_scratch_can_be_written(gpu: bool | tuple[int, ...], namespaced: bool) -> None:
     """And to devices; with a GPU also the names of threads. Of processes a jail reads its own."""
     jail: Any = SimpleNamespace(
         common=SimpleNamespace(

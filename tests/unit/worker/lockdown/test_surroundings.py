@@ -80,9 +80,7 @@ def test_the_announcement_is_one_line_of_json() -> None:
     assert set(json.loads(said)) == {"envhub-worker", "server_key", *found}
 
 
-def test_a_derived_image_brings_the_interpreter_of_its_jails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_derived_image_brings_its_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of servers for clients on other hosts, too, who cannot name one; else it is the server's."""
     monkeypatch.setattr(probe, "ENVIRONMENT", tmp_path / "python")
     assert probe.own_runtime() == OWN

@@ -70,9 +70,7 @@ def test_a_change_is_reported_once_by_its_name(
     assert reported == [name]
 
 
-def test_what_takes_longer_to_read_is_looked_at_by_itself(
-    scene: ModuleType, tmp_path: Path
-) -> None:
+def test_what_takes_long_to_read_is_looked_at_by_itself(scene: ModuleType, tmp_path: Path) -> None:
     """Not at each step, and ever more seldom."""
     reported: list[str] = []
     state = SharedState(str(tmp_path), reported.append)
@@ -84,9 +82,7 @@ def test_what_takes_longer_to_read_is_looked_at_by_itself(
     assert reported == ["module"]
 
 
-def test_torch_is_looked_at_also_where_it_is_imported_later(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_late_torch_is_looked_at_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torch = pytest.importorskip("torch")
     monkeypatch.delitem(sys.modules, "torch")
     reported: list[str] = []

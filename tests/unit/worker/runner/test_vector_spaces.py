@@ -56,9 +56,7 @@ def one_space(space: Space, action: Space) -> dict[str, Space]:
         (SEEN, {"envs": [SimpleNamespace(observation_space=ROW, action_space=ROW)]}, ROW),
     ],
 )
-def test_one_row_is_the_space_of_one(
-    observation: Any, attributes: dict[str, Any], expected: Space
-) -> None:
+def test_one_row_is_of_one(observation: Any, attributes: dict[str, Any], expected: Space) -> None:
     """A declared space is batched if the first observation has its shape; else it is of one."""
     known = spaces_of(vector(observation, **attributes), {})
     assert known.single_observation_space == expected

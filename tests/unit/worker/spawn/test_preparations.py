@@ -28,9 +28,7 @@ def spec_of(snapshot: Path, *copies: HubCopy, **environment: str) -> JailSpec:
     )
 
 
-def test_the_snapshot_is_a_link_to_the_files(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_snapshot_is_a_link_to_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every runner of a jail makes the same, and huggingface_hub finds it without a network."""
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
     other = tmp_path / "other"
@@ -46,9 +44,7 @@ def test_the_snapshot_is_a_link_to_the_files(
     assert Path(found).resolve() == tmp_path.resolve()
 
 
-def test_a_cache_that_the_caller_gives_stays_as_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_callers_cache_stays_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_HOME", str(tmp_path / "theirs"))
     copy = HubCopy("models--org--repo", COMMIT, ("main",), "")
     make_hub_cache(spec_of(tmp_path, copy, HF_HOME=str(tmp_path / "theirs")))
@@ -94,9 +90,7 @@ def test_the_rest_is_missing_as_before() -> None:
         exec("from lerobot.envs.configs import AlohaEnv")
 
 
-def test_lerobot_itself_is_imported_for_what_the_stub_lacks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lerobot_has_what_the_stub_lacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither for the stub's names nor for a caller's configuration, which counts as what it is in
     LeRobot once that is there; and without a warning, since LeRobot is installed."""
     for package in ("lerobot", "lerobot/envs"):

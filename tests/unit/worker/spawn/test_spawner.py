@@ -100,9 +100,7 @@ def test_runners_draw_different_random_numbers(cell: Cell) -> None:
 
 
 @pytest.mark.parametrize("killed", [True, False])
-def test_a_runner_that_ends_takes_its_children_along(
-    cell: Cell, folder: Path, killed: bool
-) -> None:
+def test_a_runner_that_ends_takes_children_along(cell: Cell, folder: Path, killed: bool) -> None:
     """Those of its session, and when it is killed all; others of its jail go on."""
     second = cell.start()
     mark = str(folder / "mark")
@@ -214,9 +212,7 @@ def test_requests_wait_for_the_zygote(folder: Path) -> None:
         assert [cell.run("result = 1") for cell in cells] == [{"result": 1}] * 5
 
 
-def test_a_jail_that_cannot_be_announced_ends_alone_and_says_why(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_is_not_announced_ends_alone_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
     """Others of its user may have all the descriptors on their way that the kernel permits."""
 
     def refuse(channel: Channel, message: dict[str, Any], pid: int) -> None:

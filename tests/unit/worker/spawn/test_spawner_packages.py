@@ -135,9 +135,7 @@ def test_the_zygote_imports_no_package(folder: Path, runtime: Runtime) -> None:
         pytest.param("closed", "no-userns", marks=needs("no-userns")),
     ],
 )
-def test_packages_that_cannot_be_read_are_told(
-    folder: Path, runtime: Runtime, what: str, profile: str
-) -> None:
+def test_unreadable_ones_are_told(folder: Path, runtime: Runtime, what: str, profile: str) -> None:
     confinement = Confinement(profile=profile)
     packages = Path(runtime.packages)
     if what == "missing":
@@ -166,9 +164,7 @@ def test_a_server_keeps_packages_from_being_removed(folder: Path, runtime: Runti
 
 
 @pytest.mark.parametrize("what", ["packages", "snapshot"])
-def test_what_is_removed_all_the_same_is_not_blamed_on_the_kernel(
-    folder: Path, runtime: Runtime, what: str
-) -> None:
+def test_what_is_removed_is_no_kernels_fault(folder: Path, runtime: Runtime, what: str) -> None:
     with spawner_in(folder, STRICT, runtime=runtime) as spawner:
         snapshot = make_snapshot(folder)
         cell = new_cell(spawner, snapshot, STRICT)
@@ -183,9 +179,7 @@ def test_what_is_removed_all_the_same_is_not_blamed_on_the_kernel(
     assert "call make_env again" in failed.fix
 
 
-def test_what_every_jail_imports_is_named_where_it_is_missing(
-    folder: Path, runtime: Runtime
-) -> None:
+def test_what_every_jail_imports_is_named_where_missing(folder: Path, runtime: Runtime) -> None:
     with spawner_in(folder, STRICT, runtime=runtime, target=RUNNER_TARGET) as spawner:
         cell = new_cell(spawner, make_snapshot(folder), STRICT)
         cell.start()

@@ -41,10 +41,7 @@ def test_what_a_jail_was_denied_is_known_when_it_is_ended(fails: bool) -> None:
     """Also if what ends it is heard of first, on another descriptor; and it dies of that. Its last
     words may be lost, as where its server has no descriptors left; that goes on."""
     jail = Mock()
-    jail.poll.return_value = [
-        CallDenied("socket", "AF_INET"),
-        RunnerExited(1, None, 9, "signal"),
-    ]
+    jail.poll.return_value = [CallDenied("socket", "AF_INET"), RunnerExited(1, None, 9, "signal")]
     if fails:
         jail.poll.side_effect = AssertionError("no room for a descriptor")
     with told_of(jail) as (events, entry, witness, _):

@@ -120,9 +120,7 @@ def test_jails_and_their_runners_are_bounded(ours: Jails, monkeypatch: pytest.Mo
         opened(ours)
 
 
-def test_a_jail_whose_runner_cannot_be_asked_for_ends(
-    ours: Jails, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_jail_without_its_runner_ends(ours: Jails, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the cause for its client; else the others would live on, and nobody hear of them."""
     start = _Jail.start_runner
 

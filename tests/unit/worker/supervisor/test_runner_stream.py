@@ -53,9 +53,7 @@ def test_an_answer_that_nobody_asked_for_is_refused(
     assert set(link.pending) == {1, 2}
 
 
-def test_a_runner_that_does_not_read_keeps_nobody_waiting(
-    ends: tuple[RunnerLink, socket.socket],
-) -> None:
+def test_a_runner_that_never_reads_delays_nobody(ends: tuple[RunnerLink, socket.socket]) -> None:
     link, runner = ends
     large = bytes(8 << 20)
     link.send(1, [b"", large], "owner")

@@ -108,9 +108,7 @@ def test_a_step_is_written_and_answered(served: Served) -> None:
     assert len(taken) == 1
 
 
-def test_a_runner_that_is_awake_is_not_rung(
-    served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_runner_awake_is_not_rung(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     """However long this test is not given a core: the clock goes on only where it is read."""
     monkeypatch.setattr(served_slabs, "perf_counter_ns", itertools.count(0, 15_000).__next__)
     os.set_blocking(served.runner.bell, False)
@@ -144,9 +142,7 @@ def test_no_client_keeps_a_server_awake(served: Served, monkeypatch: pytest.Monk
     assert any(served.steps.look() != 0 for _ in range(1000))
 
 
-def test_both_sides_sleep_where_waiting_awake_is_not_permitted(
-    served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_both_sleep_where_none_may_spin(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     """On one core, or on one that may see the announcement before what is announced."""
     monkeypatch.setattr(*inside.MAY_SPIN, False)
     served.ask(spin_ns=60_000_000_000)

@@ -81,9 +81,7 @@ def _broken(number: int) -> Any:
         (_broken, 2, "it broke\\x1b[2J"),
     ],
 )
-def test_what_renders_badly_is_told_and_fails_nothing(
-    render: Callable[[int], Any], stills: int, says: str
-) -> None:
+def test_bad_frames_fail_nothing(render: Callable[[int], Any], stills: int, says: str) -> None:
     made = film(walks(render), seed=0, seconds=600)
     assert (len(made.stills), says in made.lacks) == (stills, True), made.lacks
 

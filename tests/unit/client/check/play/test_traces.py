@@ -50,9 +50,7 @@ def played(mode: str, begun: Sequence[float], *steps: tuple[float, bool]) -> Tra
 @pytest.mark.parametrize(
     ("after", "noted"), [(_MORE, False), ((1.0, False), True), (_END, True), ((1.0, True), True)]
 )
-def test_the_step_that_resets_gives_nothing_and_ends_nothing(
-    after: tuple[float, bool], noted: bool
-) -> None:
+def test_a_step_that_resets_gives_and_ends_nothing(after: tuple[float, bool], noted: bool) -> None:
     """The control is the mode in which there is no such step."""
     assert bool(played("NextStep", [0.0], _END, after).notes["autoreset"]) is noted
     assert not played("Disabled", [0.0, 0.0], _END, after).notes["autoreset"]
@@ -87,9 +85,7 @@ def traced(seen: Any, rewards: Sequence[float] = (0.0, 0.0)) -> Trace:
     ],
     ids=["row", "reward", "text", "dtype", "too large to be kept"],
 )  # fmt: skip
-def test_what_differs_is_told_with_its_row_and_values(
-    one: Any, other: Any, at: int, words: str
-) -> None:
+def test_what_differs_has_its_row_and_values(one: Any, other: Any, at: int, words: str) -> None:
     """Of results that are kept; that they differ is told of all."""
     first, second = traced(*one), traced(*other)
     assert first.differs_from(second) == at

@@ -164,9 +164,7 @@ LEGACY = "setuptools.build_meta:__legacy__"
         ("[build-system]\nrequires = []\nbuild-backend = 'a.b:c'\n", [], "a.b:c"),
     ],
 )
-def test_how_it_is_built(
-    tmp_path: Path, text: str | None, requires: list[str], backend: str
-) -> None:
+def test_how_to_build(tmp_path: Path, text: str | None, requires: list[str], backend: str) -> None:
     """As the standards have it: setuptools is what builds where nothing is said."""
     if text is not None:
         (tmp_path / "pyproject.toml").write_text(text)
@@ -219,9 +217,7 @@ def test_nothing_is_guessed() -> None:
     assert project.advice("No such file or directory: 'README.md'\nSyntaxError") == ""
 
 
-def test_downloads_are_bounded_and_verified(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_downloads_are_bounded_and_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     shelf, target = tmp_path / "shelf", tmp_path / "target"
     shelf.mkdir()
@@ -245,9 +241,7 @@ def test_downloads_are_bounded_and_verified(
             download.download(other, known, target)
 
 
-def test_a_login_goes_to_the_host_of_its_index_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_login_goes_to_its_index_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UV_INDEX", "mine=https://me:secret@index.example/simple")
     monkeypatch.setenv("NETRC", str(tmp_path / "none"))
     assert download.login_for("https://index.example/x") == ("me", "secret")
@@ -257,9 +251,7 @@ def test_a_login_goes_to_the_host_of_its_index_alone(
     assert "secret" not in str(caught.value)
 
 
-def test_a_login_is_not_sent_to_where_a_host_redirects(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_login_follows_a_redirect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("NO_PROXY", "no_proxy"):
         monkeypatch.setenv(name, "127.0.0.1,localhost")
     sent: list[str | None] = []

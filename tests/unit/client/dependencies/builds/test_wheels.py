@@ -44,9 +44,7 @@ def test_what_was_asked_for_is_taken(tmp_path: Path) -> None:
         ("some-name", "1.0", "py3-none-win32", "does not fit Python"),
     ],
 )
-def test_another_package_is_refused(
-    tmp_path: Path, name: str, version: str, tag: str, said: str
-) -> None:
+def test_others_are_refused(tmp_path: Path, name: str, version: str, tag: str, said: str) -> None:
     with refused_dependency("integrity", match=said):
         check(make_wheel(tmp_path, name, version, tag=tag))
 

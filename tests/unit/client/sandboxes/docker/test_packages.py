@@ -40,9 +40,7 @@ def declares(*lines: str, supports: str = "", python: str = "") -> PackageReques
         ("pytest", "3.12.1", "pytest"),  # which is here, and not there
     ],
 )
-def test_what_an_image_has_is_read_off_its_metadata(
-    line: str, python: str, lacking: str | None
-) -> None:
+def test_what_an_image_has_is_in_its_metadata(line: str, python: str, lacking: str | None) -> None:
     """With the markers of the image's Python, and nothing of this one."""
     assert interpreters.first_unmet(declares(line), THERE, python) == lacking
 

@@ -108,9 +108,7 @@ NO_GROUPS = {"memory": None, "pids": None, "cpus": None}
     ],
     ids=["podman", "users mapped", "docker's GPUs", "podman's GPUs", "no groups", "a comma"],
 )
-def test_each_engine_gets_its_own_words(
-    engine: Engine, changes: dict[str, Any], expected: set[Any]
-) -> None:
+def test_words_of_each_engine(engine: Engine, changes: dict[str, Any], expected: set[Any]) -> None:
     words = run_arguments.run_arguments(engine, replace(WANTED, **changes))
     assert expected <= {*words, *itertools.pairwise(words)}
     assert ("--memory" in words) == ("--pids-limit" in words) == (changes is not NO_GROUPS)
@@ -267,9 +265,7 @@ def test_the_profile_for_ones_own_containers_is_the_same() -> None:
 @pytest.mark.parametrize(
     "image", ["", "-it", "--format=x", "a b", "a\nRUN evil", "a\t", "a\u2028b", " envhub-worker"]
 )
-def test_what_is_no_name_of_an_image_reaches_no_engine(
-    image: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_names_no_image_reaches_no_engine(image: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It would be an option, or a line of a recipe; a name is asked for as it stands."""
     asked = list[str]()
     monkeypatch.setattr(Engine, "run", lambda _, *words: asked.extend(words) or "sha256:1\n")
@@ -310,9 +306,7 @@ def test_without_an_engine_each_is_named(monkeypatch: pytest.MonkeyPatch, tmp_pa
         engines.find_engine(None)
 
 
-def test_an_engine_on_another_machine_is_refused(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_remote_engine_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     program = tmp_path / "docker"
     program.write_text("#!/bin/sh\n")
     program.chmod(0o755)
@@ -366,9 +360,7 @@ def test_an_engine_says_what_it_is(
             DockerSandbox(engine="docker").for_repository(tmp_path, Policy(), Runtime(""))
 
 
-def test_an_engine_without_a_server_is_not_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_engines_without_servers_are_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     facts = {"ServerErrors": ["Cannot connect to the Docker daemon at unix:///x"]}
     with pytest.raises(SandboxUnavailableError, match="systemctl start docker"):
         engine_that_says(tmp_path, monkeypatch, "Docker version 28", facts)

@@ -216,9 +216,7 @@ def test_nothing_of_this_machine_is_mounted(tmp_path: Path) -> None:
 # --- with mounts, in place of a port
 
 
-def test_a_container_that_is_mounted_serves_until_it_is_given_back(
-    sandbox: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_a_mounted_one_serves_until_given_back(sandbox: Callable[..., Any], tmp_path: Path) -> None:
     """Its layers are those that hold; then its processes and its folder are gone."""
     before = descendants()
     use = sandbox("serves", mounts=True).acquire(tmp_path)

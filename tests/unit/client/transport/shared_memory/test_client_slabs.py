@@ -68,9 +68,7 @@ def test_one_slot_is_copied_out(slab_of: Callable[..., ObservationSlab]) -> None
     assert all(leaf.flags.owndata for leaf in (first["seen"], *first["both"]))
 
 
-def test_a_slot_is_written_again_when_no_array_of_it_is_held(
-    slab_of: Callable[..., ObservationSlab],
-) -> None:
+def test_a_slot_is_reused_when_no_array_is_held(slab_of: Callable[..., ObservationSlab]) -> None:
     """Views of views count; when all are held the batch is copied, and the lowest is hot."""
     slab = slab_of(BOX, RING + 1)
     held = []
@@ -95,9 +93,7 @@ def test_a_slot_is_written_again_when_no_array_of_it_is_held(
 
 
 @pytest.mark.parametrize("slots", [1, 2])
-def test_a_hostile_byte_makes_no_third_boolean(
-    slab_of: Callable[..., ObservationSlab], slots: int
-) -> None:
+def test_no_byte_is_a_third_boolean(slab_of: Callable[..., ObservationSlab], slots: int) -> None:
     slab = slab_of(MASK, slots)
     slab.choose()
     layout = slab.layout
@@ -145,9 +141,7 @@ def serving(path: Path, losses: int) -> threading.Thread:
 
 
 @pytest.mark.parametrize("losses", [0, 2])
-def test_a_lost_connection_is_made_again(
-    tmp_path: Path, losses: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_connects_again(tmp_path: Path, losses: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # a socket's path has 108 bytes
     server = serving(Path("fds"), losses)
     ours, theirs = os.pipe()
@@ -158,9 +152,7 @@ def test_a_lost_connection_is_made_again(
     assert not server.is_alive()
 
 
-def test_a_server_that_has_not_heard_of_the_jail_is_asked_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_knows_no_jail_is_asked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """More often than one that fails: its zygote may be held up for a while."""
     monkeypatch.chdir(tmp_path)
     ours, theirs = os.pipe()
@@ -185,9 +177,7 @@ def test_a_server_that_has_not_heard_of_the_jail_is_asked_again(
     deposits.close()
 
 
-def test_a_server_that_takes_nothing_is_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_that_takes_nothing_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     serving(Path("fds"), 50)
     with pytest.raises(ConnectionError):

@@ -169,9 +169,7 @@ def test_memfd_is_measured_without_being_mapped_unless_it_is_the_clients() -> No
     os.close(fd)
 
 
-def test_reserved_shared_memory_counts_no_more_than_the_machine_has(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_reserved_memory_counts_no_more_than_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Over the limit by the upper bound, what all programs together share decides."""
     monkeypatch.setattr(watchdog, "shared_of_the_machine", lambda: 64 * MIB)
     with mmap.mmap(-1, 4 * GIB):

@@ -21,9 +21,7 @@ time.sleep(600)
 """
 
 
-def test_a_child_that_appears_after_the_last_look_is_killed_too(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_child_after_the_last_look_is_killed_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """A fork that had begun when its process was stopped may end after we looked, at any time."""
     monkeypatch.setattr(reap, "PATIENCE_S", 1.0)
     with subprocess.Popen([sys.executable, "-c", TREE], stdout=subprocess.PIPE) as root:

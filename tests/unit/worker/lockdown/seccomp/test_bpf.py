@@ -84,9 +84,7 @@ def test_what_the_kernel_would_refuse_is_refused(
     padding=st.integers(0, 40),
     number=st.integers(0, 70),
 )
-def test_chain_of_comparisons_finds_its_label(
-    targets: list[int], padding: int, number: int
-) -> None:
+def test_comparisons_find_their_label(targets: list[int], padding: int, number: int) -> None:
     items: list[object] = [Do(LOAD, 0)]
     items += [Branch(JUMP_EQUAL, n, f"l{target}", None) for n, target in enumerate(targets)]
     items.append(Do(RETURN, 999))

@@ -183,9 +183,7 @@ def children() -> Iterator[tuple[int, int]]:
         *(("setpriority", 1), ("ioprio_set", 1)),
     ],
 )
-def test_what_is_not_below_init_is_another(
-    call: str, place: int, children: tuple[int, int]
-) -> None:
+def test_what_is_not_below_init_is_other(call: str, place: int, children: tuple[int, int]) -> None:
     """Also what cannot have been there; not so the caller, nor what lives with it."""
     first, second = children
 

@@ -284,9 +284,7 @@ def test_memory_out_of_sight_is_denied_where_it_is_measured(machine: str) -> Non
 @machines
 @pytest.mark.parametrize("network", ["none", "host"])
 @pytest.mark.parametrize("namespaced", [True, False])
-def test_what_is_recorded_is_denied_all_the_same(
-    machine: str, network: str, namespaced: bool
-) -> None:
+def test_what_is_recorded_is_denied_too(machine: str, network: str, namespaced: bool) -> None:
     """Whatever is asked of init is what would have been refused, and init refuses it likewise. With
     one exception: what would have been permitted whatever its arguments, and is only seen."""
     plain = policy_table(namespaced=namespaced, network=network)
