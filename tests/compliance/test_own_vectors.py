@@ -16,7 +16,12 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import RemoteEnvError, RemoteEnvWarning, RemoteProtocolError
+from envhub_sandbox.errors import (
+    ActionError,
+    RemoteEnvError,
+    RemoteEnvWarning,
+    RemoteProtocolError,
+)
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.shared_memory import lane
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
@@ -458,7 +463,9 @@ def _played(envs: list[Any]) -> list[Any]:
             heard.append(f"{type(error).__mro__[1].__name__}: {error}".partition("\n")[0])
         if number % 10 == 0:
             heard += [env.call("count"), env.reset() if number == 20 else env.get_attr("wide")]
-    return heard
+    with pytest.raises((RemoteEnvError, ActionError)) as caught:
+        envs[0].step(np.array([*[None] * 9000, np.zeros(3000)], object))
+    return [*heard, f"{caught.value}".partition("\n")[0]]
 
 
 @pytest.mark.parametrize(
@@ -506,7 +513,7 @@ def test_an_own_vector_is_stepped_in_shared_memory_and_returns_the_same(
     assert by_server == {"step": 6 * tasks}  # infos that do not fit
     assert read.call_count > 10 * tasks
     errors = [text for text in heard["auto"] if isinstance(text, str)]
-    assert len(errors) == 4 * tasks
+    assert len(errors) == 4 * tasks + 1
     assert ["no step 5" in errors[0], "rewards" in errors[tasks]] == [True, True]
 
 

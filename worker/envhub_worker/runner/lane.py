@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.arrays import NUMBERS
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.messages.forms import IrregularError
 from envhub_worker.protocol.shared_memory import slabs
@@ -193,8 +194,8 @@ class Lane:
         start = self._message
         frames = read_packet(self._requested[start : start + length], DEFAULT_LIMITS)
         request = self._read(frames)
-        if type(request) is m.Step and type(request.actions) is np.ndarray:
-            array = request.actions
+        array = request.actions if type(request) is m.Step else None
+        if type(array) is np.ndarray and array.dtype in NUMBERS:  # objects are no bytes in there
             start += array_start(frames, array.nbytes)
             self._step = count, np.ndarray(array.shape, array.dtype, self._request, start)
         return request
