@@ -1,7 +1,7 @@
-"""Describes what has no form of its own on the wire: spaces, specs and generators by plain values,
-of which the client makes them again; exceptions of the repository by text.
+"""Describes objects that the wire has no form for: spaces, specs and generators by plain values,
+from which the client rebuilds them; the repository's exceptions by text.
 
-Runs in the jail; the client checks what it says.
+Runs in the jail; the client checks every description.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SPEC_FIELDS = ("id", "max_episode_steps", "reward_threshold", "nondeterministic"
 
 
 def described(value: object) -> tuple[int, object] | None:
-    """What kind of thing it is, and the plain values that it is made of; None if it is no such."""
+    """Returns the kind of an object and plain values to rebuild it; None without a description."""
     try:
         if isinstance(value, gym.Space):
             return SPACE, encode_space(value, seeded=True)
@@ -43,7 +43,7 @@ def described(value: object) -> tuple[int, object] | None:
 
 
 def facts_of(spec: Any) -> dict[str, Any]:
-    """What a spec says about the environment, and nothing of how it is made."""
+    """Returns a spec's facts about the environment, without how to make it."""
     return {name: getattr(spec, name, None) for name in SPEC_FIELDS}
 
 
@@ -58,7 +58,7 @@ def raised(error: BaseException, stage: str, root: str = "") -> RaisedException:
     """The message for an exception: its nearest builtin ancestor, its text, its traceback.
     ``root``: the repository's folder, to which its files are named relative.
     """
-    # a package that may not be read is imported all the same, as one without a file of its own
+    # Python imports an unreadable package as a namespace package, without its own file.
     why = ""
     nowhere = isinstance(error, ImportError) and error.path is None
     hidden = why_file_hidden(str(getattr(error, "name", ""))) if nowhere else ""
@@ -81,7 +81,7 @@ def raised(error: BaseException, stage: str, root: str = "") -> RaisedException:
 
 
 def _builtin(kind: type[BaseException]) -> str:
-    """Its nearest builtin ancestor that says anything, or else its nearest one of Gymnasium's."""
+    """Names the nearest builtin ancestor of an error's class; Gymnasium's if that is Exception."""
     own = [base for base in kind.__mro__ if getattr(builtins, base.__name__, None) is base]
     theirs = [base for base in kind.__mro__ if base.__module__ == _GYMNASIUM]
     if theirs and own and own[0] is Exception:
@@ -97,7 +97,7 @@ def _text(error: BaseException) -> str:
 
 
 def _usage(error: BaseException) -> str:
-    """What argparse printed before it left, where it did."""
+    """Returns the usage text that argparse printed before it exited, if it did."""
     parsing = getattr(sys.modules.get("argparse"), "__file__", None)
     if not isinstance(error, SystemExit) or parsing is None:
         return ""
@@ -109,7 +109,7 @@ def _usage(error: BaseException) -> str:
 
 
 def _traceback(error: BaseException, root: str) -> str:
-    """The traceback, without the frames of this package that called into the repository."""
+    """Returns the traceback without this package's frames, which called into the repository."""
     try:
         whole = traceback.TracebackException.from_exception(error, compact=True)
         for link in _chain(whole):
@@ -120,7 +120,7 @@ def _traceback(error: BaseException, root: str) -> str:
 
 
 def _chain(whole: traceback.TracebackException) -> Iterator[traceback.TracebackException]:
-    """An exception, and all that its traceback shows."""
+    """Yields an exception and all exceptions that its traceback shows."""
     waiting, seen = [whole], set()
     while waiting:
         link = waiting.pop()
@@ -133,7 +133,7 @@ def _chain(whole: traceback.TracebackException) -> Iterator[traceback.TracebackE
 
 
 def _tell(link: traceback.TracebackException, root: str) -> None:
-    """Leave out frames that are not the repository's, and name its files relative to it."""
+    """Drop frames outside the repository, and name its files relative to its folder."""
     theirs = [frame for frame in link.stack if not frame.filename.startswith((_OURS, *_IMPORTING))]
     syntax = getattr(link, "filename", None) is not None  # which tells its line without a frame
     if theirs or syntax:

@@ -1,4 +1,4 @@
-"""Environments of another library than Gymnasium: ``old_gym`` adapts those of ``gym``."""
+"""Environments of libraries other than Gymnasium: the extra ``old_gym`` adapts those of ``gym``."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from envhub_worker.find_extra import find_extra
 
 
 class _NoAdapter:
-    """Adapts nothing, and knows no environments but Gymnasium's: see ``old_gym``."""
+    """Stands for ``old_gym`` where that extra is missing: adapts no environment."""
 
     def is_env(self, value: object) -> bool:
-        """Whether it is an environment of that library."""
+        """Whether an object is an environment of the other library."""
         return False
 
     is_vector = is_env
 
     def adapted(self, env: Any) -> Any:
-        """An environment as one of Gymnasium."""
+        """Adapts an environment to Gymnasium's interface."""
         return env
 
     adapted_vector = space_of = adapted
 
     def explained(self, error: Exception, env: Any, method: str) -> Exception:
-        """The error, or one that says what is old about the environment's ``method``."""
+        """Returns the error, or one that explains how the environment's ``method`` is outdated."""
         return error
 
 

@@ -1,14 +1,14 @@
-"""Older releases of Gymnasium in a jail, as the client's own would have it: 0.26 to 1.0.
+"""Makes Gymnasium 0.26 to 1.0 in a jail behave like the client's current release.
 
-What they lack is added here, so that no other module asks for a version:
+This module adds what they lack, so that no other module asks for a version:
 
 - **Autoreset.** Before 1.1 there is no mode to choose. 1.0 resets in the step after the end, as
   ``NextStep`` does; 0.29 in the same step, as ``SameStep`` does, but with the last observation as
   ``final_observation``. Vector environments of 0.29 are described as ``SameStep``, and their last
   observations and infos are called ``final_obs`` and ``final_info``, with a dict of arrays for the
   latter.
-- **Attributes.** Before 0.29, wrappers pass on whatever they are asked for, and have no method that
-  does so; a ``MultiDiscrete`` starts at zero, and a ``Sequence`` is not stacked.
+- **Attributes.** Before 0.29, wrappers forward every attribute by ``__getattr__`` and have no
+  ``get_wrapper_attr``; a ``MultiDiscrete`` starts at zero, and a ``Sequence`` is not stacked.
 - **Vector environments.** Those of 0.29 have no ``render``, one random generator for all, and look
   attributes up in the outermost wrapper only.
 """
@@ -54,7 +54,7 @@ if not hasattr(gym.Env, "get_wrapper_attr"):
 
 
 def mode_named(mode: Any) -> str:
-    """The name of an autoreset mode, given as Gymnasium takes it."""
+    """Returns the name of an autoreset mode; takes every form that Gymnasium accepts."""
     return str(mode if _MODES is None else _MODES(mode).value)
 
 
@@ -71,7 +71,7 @@ def mode_of(env: Any, stated: Any) -> Any:
 
 
 def renamed(info: Mapping[Any, Any]) -> dict[Any, Any]:
-    """The infos of a vector environment of old, under the names of today."""
+    """Renames the infos of an old vector environment to today's names."""
     infos: dict[Any, Any] = {}
     for key, value in info.items():
         is_mask = isinstance(key, str) and key.startswith("_") and key[1:] in info
@@ -95,13 +95,13 @@ def _entry(key: Any, values: Any, mask: Any) -> dict[Any, Any]:
 
 
 def reset_result(env: Any, result: Any) -> tuple[Any, Any]:
-    """What ``reset`` of a repository's own vector environment returned, as Gymnasium has it."""
+    """Converts what a repository's own vector environment returns from ``reset``."""
     observation, infos = _parts(env, "reset", result, ("observations", "infos"))
     return observation, _own_infos(env, "reset", infos)
 
 
 def step_result(env: Any, result: Any) -> tuple[Any, ...]:
-    """The same of ``step``."""
+    """Converts what a repository's own vector environment returns from ``step``."""
     names = ("observations", "rewards", "terminations", "truncations", "infos")
     observation, *columns, infos = _parts(env, "step", result, names)
     each = zip(names[1:-1], columns, (np.float64, np.bool_, np.bool_), strict=True)
@@ -118,7 +118,7 @@ def _parts(env: Any, method: str, result: Any, names: tuple[str, ...]) -> Any:
 
 
 def _column(env: Any, name: str, values: Any, dtype: Any) -> Any:
-    """One value each: an array, or a list of numbers, which Gymnasium's wrappers take as well."""
+    """Returns one value per sub-environment: an array; Gymnasium's wrappers take lists, too."""
     if isinstance(values, (list, tuple)):
         try:
             values = np.asarray(values, None if name == "rewards" else dtype)
@@ -135,7 +135,7 @@ def _column(env: Any, name: str, values: Any, dtype: Any) -> Any:
 
 
 def _own_infos(env: Any, method: str, infos: Any) -> Any:
-    """Infos as one dict; a list of dicts is merged as Gymnasium does."""
+    """Returns infos as one dict; merges a list of dicts like Gymnasium."""
     if isinstance(infos, dict):
         return infos
     mappings = isinstance(infos, (list, tuple)) and all(isinstance(info, dict) for info in infos)
@@ -151,7 +151,7 @@ def _misfit(env: Any, method: str, complaint: str) -> Exception:
 
 
 class _WithMode(SyncVectorEnv):
-    """``SyncVectorEnv`` of 1.0, with an autoreset mode; what it does in ``step`` is not used."""
+    """``SyncVectorEnv`` of 1.0 with an autoreset mode; the runner does not use its ``step``."""
 
     def __init__(self, env_fns: Any, *, copy: bool, autoreset_mode: str) -> None:
         super().__init__(env_fns, copy=copy)
@@ -160,7 +160,7 @@ class _WithMode(SyncVectorEnv):
 
 
 class _OldSyncVectorEnv(_WithMode):
-    """``SyncVectorEnv`` of 0.29 with what it has since."""
+    """``SyncVectorEnv`` of 0.29 with the methods of later releases."""
 
     def render(self) -> Any:
         return tuple(env.render() for env in self.envs)
@@ -192,7 +192,7 @@ class _OldSyncVectorEnv(_WithMode):
 
     @np_random.setter
     def np_random(self, value: Any) -> None:
-        """Gymnasium's own ``seed`` sets it; each sub-environment keeps its own."""
+        """The generator that Gymnasium's ``seed`` sets; each sub-environment keeps its own."""
 
     @property
     def np_random_seed(self) -> Any:
@@ -200,7 +200,7 @@ class _OldSyncVectorEnv(_WithMode):
 
 
 def owner(env: Any, name: str) -> Any:
-    """The wrapper, or what is wrapped, that has this attribute itself; else the outermost."""
+    """Returns the outermost layer that has an attribute itself; else the outermost layer."""
     for layer in layers(env):
         if name in vars(layer) or hasattr(type(layer), name):
             return layer
@@ -208,7 +208,7 @@ def owner(env: Any, name: str) -> Any:
 
 
 def layers(env: Any) -> Iterator[Any]:
-    """The wrappers from the outermost on, and what is wrapped; ``gym``'s wrappers count as well."""
+    """Yields wrappers, ``gym``'s included, from the outermost on, then the wrapped environment."""
     while isinstance(env, gym.Wrapper) or descends_from(env, "gym.core", "Wrapper"):
         yield env
         env = env.env
@@ -216,7 +216,7 @@ def layers(env: Any) -> Iterator[Any]:
 
 
 def descends_from(value: object, module: str, name: str) -> bool:
-    """Whether its class has an ancestor of this name, which need not be imported here."""
+    """Whether an object's class has an ancestor of this name. Does not import that ancestor."""
     return any((cls.__module__, cls.__qualname__) == (module, name) for cls in type(value).__mro__)
 
 
@@ -229,7 +229,7 @@ Parameters = dict[str, inspect.Parameter]
 
 
 def parameters_of(function: Callable[..., Any]) -> Parameters | None:
-    """The parameters by name; None where Python cannot tell."""
+    """Returns a function's parameters by name; None if Python cannot tell."""
     try:
         return dict(inspect.signature(function).parameters)
     except (TypeError, ValueError):
@@ -237,14 +237,14 @@ def parameters_of(function: Callable[..., Any]) -> Parameters | None:
 
 
 def takes(parameters: Parameters, name: str) -> bool:
-    """Whether a keyword argument of this name can be given."""
+    """Whether a function takes a keyword argument of this name."""
     return names(parameters, name) or any(
         item.kind is inspect.Parameter.VAR_KEYWORD for item in parameters.values()
     )
 
 
 def names(parameters: Parameters, name: str) -> bool:
-    """Whether it has a parameter of this name, which can be given by keyword."""
+    """Whether a function declares a parameter of this name that can be passed by keyword."""
     parameter = parameters.get(name)
     return parameter is not None and parameter.kind is not inspect.Parameter.POSITIONAL_ONLY
 
@@ -264,7 +264,7 @@ _NUMPYS_OLD_NAMES = {
 
 
 def restore_numpys_names() -> None:
-    """Define them where ``gym`` can be imported, before any of its code runs."""
+    """Define numpy's removed names if ``gym`` is installed, before any code of ``gym`` runs."""
     if find_spec("gym") is not None:
         for name, value in _NUMPYS_OLD_NAMES.items():
             vars(np).setdefault(name, value)

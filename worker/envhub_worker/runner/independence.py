@@ -1,21 +1,22 @@
-"""Whether the sub-environments of an asynchronous environment may share a process.
+"""Tests whether the sub-environments of an asynchronous environment may share a process.
 
-``AsyncVectorEnv`` gives each a process. Several of them in one give the same results only where
-none touches what a process has once. No list of names shows that, so it is tried: forks of this
-runner play the sub-environments, once all together and once each alone, with equal seeds and
-actions. They may share a process if every observation, reward, flag and info is equal to the last
-bit, and nothing that ``SharedState`` looks at has changed. What cannot be played within its time
-is heavy, and has no need to share; nor has what waits instead of computing, for those that share a
-process wait one after the other.
+``AsyncVectorEnv`` gives each sub-environment a process. Several in one process give the same
+results only if none of them changes state that a process has once. No static check shows that, so
+this module tries it: forks of the runner play the sub-environments, once all together and once each
+alone, with equal seeds and actions. They may share a process if every observation, reward, flag and
+info is bitwise equal and ``SharedState`` sees no change. Sub-environments that cannot be played in
+time are heavy and gain nothing from sharing; nor do those that wait instead of computing, since
+sub-environments in one process wait one after the other.
 
-The forks begin between the return of ``make_env`` and the first sub-environment that is built,
-where ``AsyncVectorEnv`` forks too, and one at a time: no more sub-environments live at once than
-in use. This process stays as it is; what the forks leave in files goes with the jail, which the
-client does not use any further.
+The forks run after ``make_env`` returns and before the first sub-environment is built, where
+``AsyncVectorEnv`` forks, too. They run one at a time, so no more sub-environments live at once than
+in use. This process does not change; files that the forks write go with the jail, which the client
+does not use again.
 
-No two plays are equal if they read a clock or the system's entropy: an elapsed time is an info of
-``RecordEpisodeStatistics``, and an unseeded generator of its own makes no sub-environment depend
-on another. In the forks both come from counters, of which each sub-environment has its own.
+Two plays would differ if they read a clock or the system's entropy: ``RecordEpisodeStatistics``
+puts an elapsed time into infos, and a sub-environment may own an unseeded generator. Neither makes
+one sub-environment depend on another. So in the forks both come from counters, one set for each
+sub-environment.
 """
 
 from __future__ import annotations
@@ -73,28 +74,28 @@ _ADDRESS = re.compile(rb"0x[0-9a-f]{4,}")
 
 
 class Budget:
-    """What all plays of a ``make_env`` may take.
+    """The time and memory that all plays of a ``make_env`` may take.
 
     Args:
         until: When to give up, by ``time.monotonic``.
-        most_bytes: Of memory that a play may take: more could be the end of the whole jail.
+        most_bytes: Memory that a play may take: more could end the whole jail.
 
     Attributes:
-        most_bytes: As given.
+        most_bytes: Memory that a play may take.
     """
 
     def __init__(self, until: float, most_bytes: int) -> None:
         self._until, self._wait_s, self.most_bytes = until, _WAIT_S, most_bytes
 
     def left_s(self, began: float, pid: int) -> float:
-        """How long the fork that ``began`` then may still wait without computing anything."""
+        """Returns how long the fork that ``began`` then may still wait without computing."""
         now, computed_s = monotonic(), 0.0
         with contextlib.suppress(OSError):  # it has ended. Followed: clock_getcpuclockid(3)
             computed_s = time.clock_gettime(~pid << 3 | 2)
         return min(self._until - now, self._wait_s - (now - began) + _LEAST_SHARE * computed_s)
 
     def take(self, left_s: float) -> None:
-        """Note that a fork has ended with so much time left."""
+        """Charge a fork that has ended with this much time left."""
         self._wait_s = min(self._wait_s, left_s)
 
 
@@ -102,9 +103,9 @@ def are_independent(task: Task, root: str, budget: Budget) -> bool:
     """Play a task's sub-environments together and apart, and compare.
 
     Args:
-        task: Of a recording, of which nothing has been built.
+        task: A task whose recording has built no sub-environment yet.
         root: The repository's folder.
-        budget: What the plays may take.
+        budget: The time and memory that the plays may take.
     """
     count = task.num_envs
     together = in_fork(partial(_play, task, range(count), None, root), count, budget)
@@ -124,8 +125,8 @@ def _offsets(count: int) -> Iterable[int]:
 
 
 def in_fork(play: Callable[[], bytes], count: int, budget: Budget) -> bytes | None:
-    """What it returns in a fork of this process: the steps, and digests of ``count``.
-    None where that fails, or takes too long or too much.
+    """Runs a play in a fork of this process; returns its steps and ``count`` digests.
+    None if the play fails or takes too much time or memory.
     """
     source, sink = os.pipe()
     try:
@@ -166,7 +167,7 @@ def _play_and_exit(play: Callable[[], bytes], sink: int, most_bytes: int) -> Non
 
 
 def _bound_memory(most_bytes: int) -> None:
-    """Let this process take at most so many more bytes of memory."""
+    """Let this process take at most this many more bytes of memory."""
     with open("/proc/self/statm") as file:
         data_pages = int(file.read().split()[5])
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
@@ -175,8 +176,8 @@ def _bound_memory(most_bytes: int) -> None:
 
 
 def _read(source: int, size: int, left_s: Callable[[], float]) -> bytes | None:
-    """So many bytes; None if they do not come in time. The end may be held open by processes that
-    the repository has started.
+    """Reads a number of bytes; None if they do not come in time. Do not wait for the end of the
+    pipe: processes that the repository has started may hold it open.
     """
     data = b""
     poller = select.poll()
@@ -191,14 +192,14 @@ def _read(source: int, size: int, left_s: Callable[[], float]) -> bytes | None:
 
 
 class HeavyError(Exception):
-    """It takes longer than there is time."""
+    """A play takes more than its time."""
 
 
 def _play(task: Task, indices: Sequence[int], steps: int | None, root: str) -> bytes:
-    """The number of steps, and a digest of what each sub-environment gave.
+    """Plays sub-environments; returns the number of steps and a digest of each one's results.
 
-    ``steps``: as many; None for as many as there is time for. Raises where it cannot be played,
-    takes too long, or changes what a process has once.
+    ``steps``: how many to play; None for as many as fit into the time. Raises if a sub-environment
+    cannot be played, takes too long, or changes state that a process has once.
     """
     assert task.recording is not None
     turns, moved = Turns(), list[str]()
@@ -227,7 +228,7 @@ def _play(task: Task, indices: Sequence[int], steps: int | None, root: str) -> b
 
 
 class _Play:
-    """Plays sub-environments, and takes a digest of what each gives."""
+    """Plays sub-environments and digests the results of each."""
 
     def __init__(self, envs: SubEnvs, indices: Sequence[int]) -> None:
         self._envs = envs
@@ -241,8 +242,8 @@ class _Play:
         self._note(self._envs.run_reset(seeds, None, mask))
 
     def step_on(self, steps: int | None) -> int:
-        """Step so many times, or as often as there is time for; returns how often.
-        Raises ``HeavyError``: that is too seldom.
+        """Step this many times, or as often as the time allows; returns the number of steps.
+        Raises ``HeavyError``: the time allows too few steps.
         """
         if steps is not None:
             for _ in range(steps):
@@ -259,7 +260,7 @@ class _Play:
         return _MOST_STEPS
 
     def step(self) -> None:
-        """Step all with actions of their own; where nothing else resets what has ended, do so."""
+        """Step all, each with its own actions; reset ended episodes if nothing else resets them."""
         envs, space = self._envs, self._envs.single_action_space
         members = [space.sample() for space in self._actions]
         empty: Any = create_empty_array(space, n=len(members), fn=np.zeros)
@@ -294,7 +295,7 @@ def _add(digest: hashlib.blake2b, value: object) -> None:
 
 
 class _Turn:
-    """One sub-environment, as far as it is driven."""
+    """Wraps one sub-environment: runs its ``reset`` and ``step`` in its turn."""
 
     def __init__(self, turns: Turns, index: int, env: Any) -> None:
         self.reset = partial(turns.run, index, env.reset)
@@ -306,7 +307,7 @@ _OURS = -1
 
 
 class Turns:
-    """Whose turn it is, and a clock and a source of entropy for each."""
+    """The current turn, with a clock and a source of entropy for each sub-environment."""
 
     def __init__(self) -> None:
         self.most_s = inf
@@ -316,7 +317,7 @@ class Turns:
         self._draws: Counter[int] = Counter()
 
     def run(self, index: int, call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """Call something of a sub-environment. Raises ``HeavyError``: it takes too much time."""
+        """Call a sub-environment's method in its turn. Raises ``HeavyError``: it takes too long."""
         if process_time() > self.most_s:
             raise HeavyError
         self._index, self._slept_s = index, 0.0
@@ -326,7 +327,9 @@ class Turns:
             self._index = _OURS
 
     def replace_sources(self) -> None:
-        """In this process, for good. Whoever has taken the functions themselves keeps those."""
+        """Replace clocks and entropy in this process for good. Code that holds a reference to an
+        original function keeps it.
+        """
         seed = random.Random.seed
         for name in ("time", "monotonic", "perf_counter", "process_time"):
             setattr(time, f"{name}_ns", lambda: _EPOCH_NS + self._tick(1_000_000))

@@ -1,9 +1,8 @@
-"""The jail's end of the fast lane: steps out of one slab into another, at the ring of a doorbell.
+"""The jail's end of the fast lane: at a ring of its doorbell it steps from one slab into another.
 
-Our doorbell is the other end of the client's socket, the client's an eventfd: both are read and
-written with whole words. Followed: ``eventfd(2)``, ``unix(7)``, ``memfd_create(2)``. The request
-slab is mapped read-only (the client has sealed it against our writes); the reply slab belongs to
-both.
+Our doorbell is the other end of the client's socket; the client's doorbell is an eventfd. Each read
+and write is one whole word. Followed: ``eventfd(2)``, ``unix(7)``, ``memfd_create(2)``. The request
+slab is mapped read-only (the client has sealed it against our writes); we write the reply slab.
 """
 
 from __future__ import annotations
@@ -34,23 +33,23 @@ _SELDOM = 16
 
 
 class Lane:
-    """One environment's requests, each of which is a message; steps as well.
+    """Serves one environment's requests, each of which is a message, steps included.
 
     Args:
-        attach: How many slots there are.
-        fds: Request slab, reply slab, observation slab, our doorbell, the client's. Owned from
-            now on.
-        read: Makes a request of its frames.
-        answer: Makes the frames of the answer to a request; none if the function that it is given
-            says that it has written the answer.
+        attach: The request that brought the slabs: rows, number of slots.
+        fds: Request slab, reply slab, observation slab, our doorbell, the client's doorbell. The
+            lane owns them.
+        read: Decodes the frames of a request.
+        answer: Encodes the answer to a request. Returns no frames if its second argument, a
+            function that may write the reply into columns, has done so.
         raised: Makes the message for an exception.
-        warned: What the repository has warned of, and no reply has taken along: while there is
-            something, answers are fetched by the server, with that in front of them.
-        watches: What the client has had watched; what has changed of it goes the same way.
+        warned: The repository's warnings that no reply has carried yet. While there are any, the
+            client fetches answers through the server, which puts them in front.
+        watches: The attributes that the client watches; their changes go the same way.
 
     Attributes:
         has_columns: Whether steps have a layout of their own.
-        unsent: The frames of the last answer, if it did not fit.
+        unsent: The frames of the last answer if the client must fetch it.
     """
 
     has_columns = False
@@ -93,8 +92,8 @@ class Lane:
         self._offers_at = 1  # misses in a row
 
     def wake(self, *, alone: bool) -> bool:
-        """After the doorbell: silence it, and serve; if ``alone``, while requests keep coming
-        quickly. Returns whether it can ring again: no, once the client has closed its end.
+        """Silence the doorbell and serve; if ``alone``, go on while requests come quickly. Returns
+        False if the client has closed its end, so that the doorbell cannot ring again.
         """
         rung = True
         with contextlib.suppress(BlockingIOError):
@@ -104,16 +103,15 @@ class Lane:
         return rung
 
     def close(self) -> None:
-        """Give the doorbells back; the slabs go with the last array over them.
-
-        Nobody waits for a step that was not begun: whoever counts them takes it for answered.
-        """
+        """Close the doorbells; the slabs go with the last array over them."""
+        # A request that was not begun counts as answered: nobody waits for it any more, and the
+        # server's idle clock counts answers by this word.
         self._told[slabs.SEQUENCE] = self._asked[slabs.SEQUENCE]
         os.close(self.bell)
         os.close(self._client_bell)
 
     def _wait_awake(self) -> bool:
-        """Wait for the next request without sleeping, for as long as the client says."""
+        """Poll for the next request without sleeping, for as long as the client says."""
         request, served = self._asked, self._served
         if self._spin_ns:
             self._told[slabs.PARKED] = 0
@@ -121,15 +119,20 @@ class Lane:
             while perf_counter_ns() < until:
                 if request[slabs.SEQUENCE] != served:
                     return True
+        # In this order: park, then look once more. A client that saw us awake did not ring, so a
+        # request that came before the word was written is seen only here.
         self._told[slabs.PARKED] = 1
         return request[slabs.SEQUENCE] != served
 
     def serve(self) -> bool:
-        """Serve a request if there is one."""
+        """Serve a request if there is one; returns whether there was."""
         sequence = self._asked[slabs.SEQUENCE]
         if sequence == self._served:
             return False
         words = self._told
+        # In this order: results, outcome and length, then the sequence word, which the client
+        # polls. Once it has risen everything before it must be readable. The doorbell is last, and
+        # only for a client that sleeps.
         words[slabs.OUTCOME], words[slabs.LENGTH] = self._run()
         self._served = sequence
         words[slabs.SEQUENCE] = sequence
@@ -154,7 +157,7 @@ class Lane:
             return slabs.RAISED, self._put(frame)
 
     def _has_more_to_say(self) -> bool:
-        """After a step: whether there is something to be put in front of its answer."""
+        """Whether a step's answer needs a prefix: warnings or changes of watched attributes."""
         if self._watched:
             self._watches.look()
         return bool(self._warned or self._changed)
@@ -201,8 +204,8 @@ class Lane:
         return request
 
     def _write_columns(self, reply: m.Message) -> bool:
-        """Write a step's results if they have the form of the columns; else offer others, if
-        these were of no use lately: rarely, where no two results are alike.
+        """Write a step's results if they have the form of the columns. Otherwise offer new columns,
+        the more rarely the more results in a row had other forms.
         """
         if type(reply) is not m.StepDone or not self._asked[slabs.TO_SLOT]:
             return False
@@ -226,7 +229,7 @@ class Lane:
         return False
 
     def leave_slot(self) -> None:
-        """The next batch is sent as a message: no longer write into the slot, which may be held."""
+        """Stop writing into the slot, which the caller may hold: the next batch is a message."""
 
     def _change(self) -> None:
         self._spin_ns = self._asked[slabs.SPIN]
@@ -239,18 +242,18 @@ class Lane:
             os.sched_setaffinity(0, {cpu - 1} if cpu else range(os.cpu_count() or 1))
 
     def infos(self) -> dict[Any, Any]:
-        """The last step's infos, where they did not fit."""
+        """Returns the last step's infos, which did not fit into the slab."""
         return {}
 
 
 class ColumnLane(Lane):
-    """The same of plain sub-environments with spaces of a fixed layout: they are stepped out of one
-    slab into another.
+    """A lane of plain sub-environments with spaces of a fixed layout: it reads actions from the
+    request slab and writes results into the other slabs.
 
     Args:
-        env: What is stepped.
-        attach: Which rows of the batch they are as well.
-        pack: Makes the frames of infos.
+        env: The sub-environments.
+        attach: As for ``Lane``; also the shard's rows in the batch.
+        pack: Encodes infos as frames.
     """
 
     has_columns = True
@@ -310,14 +313,14 @@ class ColumnLane(Lane):
         return self._writer.put(frame)
 
     def leave_slot(self) -> None:
-        """See ``Lane``: the next one goes elsewhere."""
+        """Write the next batch into arrays outside the slot: see ``Lane``."""
         self._env.batch.choose(0, carry=True)
         self._changes = -1
 
     def _change(self) -> None:
         super()._change()
         request = self._asked
-        # a message that moves is a reset: of some of the sub-environments, perhaps
+        # A message that moves slots is a reset, which may be of some sub-environments only.
         self._env.batch.choose(request[slabs.SLOT], carry=bool(request[slabs.MESSAGE]))
         codes = request[slabs.DTYPES : slabs.DTYPES + len(self._layout.actions)].tolist()
         if codes != self._codes:
@@ -326,18 +329,18 @@ class ColumnLane(Lane):
             self._takes = [self._taker(leaf, code) for leaf, code in pairs]
 
     def _taker(self, leaf: slabs.Leaf, code: int) -> Callable[[], Any]:
-        """Gives a leaf of the actions as the caller has given it."""
+        """Returns a function that reads one leaf of the actions in the caller's dtype."""
         listed, code = divmod(code, slabs.LISTED)
         view = slabs.view(self._request, leaf, slabs.ACTION_DTYPES[code])
         return view.tolist if listed else view.copy
 
     def infos(self) -> dict[Any, Any]:
-        """See ``Lane``."""
+        """Returns the last step's infos: see ``Lane``."""
         return self._env.joined(self._pairs)
 
 
 def _raised_frame(message: m.RaisedException) -> Any:
-    """The encoded exception; without its traceback where that does not fit."""
+    """Encodes an exception, without its traceback if that does not fit."""
     [frame] = m.pack(message)
     if len(frame) > slabs.INFO_BYTES:
         [frame] = m.pack(m.replace(message, traceback=""))
@@ -346,7 +349,7 @@ def _raised_frame(message: m.RaisedException) -> Any:
 
 class InfoWriter:
     """Writes infos into a slab: as columns while their schema stays the same, else encoded.
-    ``start``: offset of its info area; ``joined``: joins infos as they are sent.
+    ``start``: offset of the slab's info area; ``joined``: joins the pairs of infos.
     """
 
     def __init__(
@@ -372,9 +375,10 @@ class InfoWriter:
     def write(
         self, pairs: Pairs, integers: Sequence[bool] = (), *, encoded: bool = False
     ) -> tuple[int, int]:
-        """The outcome and the length for the reply's header. Raises ``ProtocolError``.
-        ``integers``: what ``joined`` says of the observation, which is part of the schema;
-        ``encoded``: whether it says what is no column, as of a reward that is no number.
+        """Writes infos; returns the reply's outcome and length. Raises ``ProtocolError``.
+        ``integers``: which parts of the observation are Python ints, which is part of the schema;
+        ``encoded``: whether infos hold a value that fits no column, such as a reward that is no
+        number.
         """
         unchanged = self._keys is not None and integers == self._integers and not encoded
         if unchanged and self._write_columns(pairs):
@@ -416,7 +420,7 @@ class InfoWriter:
         return True
 
     def _learn(self, pairs: Pairs, infos: dict[Any, Any]) -> None:
-        """Columns are for scalars that every sub-environment has: then all masks are true."""
+        """Learn columns for scalars that every sub-environment has: their masks are all true."""
         self._keys = None
         columns = slabs.columns_of(infos)
         first = pairs[0][1] if pairs else {}

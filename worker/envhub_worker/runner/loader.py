@@ -5,10 +5,10 @@ postponed annotations, ``from .sibling import x``, and pickling of the repositor
 own child processes work; its folder and the repository's root are importable too (``import
 sibling``). Followed: LeRobot's ``_import_hub_module`` and ``_call_make_env``.
 
-A caller's config object is made again of the plain values that have crossed (``config_of``). Each
-object comes with the names of its class and of the classes that this inherits from. The class
-itself is used where it can be imported here; else a dataclass of the same name, which inherits
-from the nearest of them that can. Followed: ``dataclasses.make_dataclass``.
+``config_of`` rebuilds a caller's config object from plain values. Each object comes with the names
+of its class and of that class's bases. If the class can be imported here, it is used; otherwise a
+dataclass of the same name, which inherits from the nearest base that can be imported.
+Followed: ``dataclasses.make_dataclass``.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from envhub_worker.runner.gymnasium_compat import (
 
 
 class ConfigMapping(dict[str, Any]):
-    """A mapping that was no dict: ``cfg.camera["width"]`` and ``cfg.camera.width`` both work."""
+    """Stands for a mapping other than dict: ``cfg.a["b"]`` and ``cfg.a.b`` both work."""
 
     def __init__(self, values: Any) -> None:
         super().__init__(values)
@@ -41,7 +41,7 @@ class ConfigMapping(dict[str, Any]):
 
 
 def config_of(value: object) -> Any:
-    """The object, or whatever else it is, that crossed as this plain value."""
+    """Rebuilds a config object, or another config value, from its plain value."""
     if isinstance(value, (list, tuple)):
         return type(value)(config_of(item) for item in value)
     if not isinstance(value, dict):
@@ -72,7 +72,7 @@ def _instance(names: Any, field_names: Any, values: dict[str, Any], computed: An
 
 
 def _filled(cls: type[Any], values: dict[str, Any]) -> Any:
-    """An instance with these attributes, as unpickling makes one: no code of its class decides."""
+    """Makes an instance with these attributes like unpickling: runs no constructor of its class."""
     instance: Any = cls.__new__(cls)  # type: ignore[call-overload]
     for item in fields(cls) if is_dataclass(cls) else ():
         if item.name not in values and not hasattr(instance, item.name):
@@ -111,13 +111,13 @@ class EntryError(AttributeError):
 
 
 class ArgumentsError(TypeError):
-    """``make_env`` takes other arguments."""
+    """The arguments of the call do not fit the signature of ``make_env``."""
 
 
 def import_entry(snapshot: str, entry: str, scratch: str) -> Callable[..., Any]:
-    """Import the entry file and give its ``make_env``; ``scratch`` is a folder that lasts.
+    """Imports the entry file and returns its ``make_env``; ``scratch`` is a folder that lasts.
 
-    Raises ``EntryError``, if there is none that can be called, and whatever the repository raises.
+    Raises ``EntryError`` if there is no callable ``make_env``, and whatever the repository raises.
     """
     path = PurePosixPath(entry)
     root = Path(snapshot)
@@ -136,8 +136,8 @@ def import_entry(snapshot: str, entry: str, scratch: str) -> Callable[..., Any]:
 
 
 def call_make_env(make_env: Callable[..., Any], request: Load | LoadTask) -> Any:
-    """Call ``make_env`` with those of our arguments that it takes.
-    Raises ``ArgumentsError``: it needs others, or does not take the caller's ``env_kwargs``.
+    """Calls ``make_env`` with those of our arguments that it takes.
+    Raises ``ArgumentsError``: it requires others, or does not take the caller's ``env_kwargs``.
     """
     offered: dict[str, Any] = {"n_envs": request.n_envs, "use_async_envs": request.use_async_envs}
     if request.cfg is not None:
@@ -151,7 +151,7 @@ def call_make_env(make_env: Callable[..., Any], request: Load | LoadTask) -> Any
 
 
 def _loaded_class(module: str, qualified_name: str) -> type[Any] | None:
-    """What ``isinstance`` takes an object for, once the repository has imported the class."""
+    """Returns the real class if the repository has imported it, so that ``isinstance`` holds."""
     found = vars(sys.modules.get(module, object)).get(qualified_name)
     return found if isinstance(found, type) else None
 
@@ -167,7 +167,7 @@ def _class_named(module: str, qualified_name: str) -> type[Any] | None:
 
 
 def _package_of(root: Path, path: PurePosixPath) -> tuple[Path, list[str]]:
-    """The folder that the package stands for, and the entry's dotted path in it."""
+    """Returns the folder of the package ``hub_env`` and the entry's dotted path in it."""
     parts = [*path.parent.parts, path.name.removesuffix(".py")]
     if any("." in part for part in parts[:-1]):
         return root / path.parent, parts[-1:]  # a folder named "v1.0" has no dotted path
@@ -177,7 +177,7 @@ def _package_of(root: Path, path: PurePosixPath) -> tuple[Path, list[str]]:
 def _make_importable(root: Path, folder: Path, scratch: str, package_path: Path) -> None:
     stub = Path(scratch) / "import" / PACKAGE
     stub.mkdir(parents=True, exist_ok=True)
-    # the runners of a jail share the folder: none may import another's half-written file
+    # The runners of a jail share the folder; none may import another's half-written file.
     draft = stub / f"{os.getpid()}.draft"
     draft.write_text(f"__path__ = [{os.fspath(package_path)!r}]\n")
     draft.replace(stub / "__init__.py")

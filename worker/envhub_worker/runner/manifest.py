@@ -1,4 +1,4 @@
-"""Describes live environments as manifests. Runs in the jail; the client checks what it says."""
+"""Describes live environments as manifests. Runs in the jail; the client checks each manifest."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _LINES = 16
 
 
 def describe(tasks: list[Task]) -> Manifest:
-    """The manifest of everything that ``make_env`` returned."""
+    """Describes everything that ``make_env`` returned as a manifest."""
     lazy = all(task.recording is not None for task in tasks)
     envs = []
     sides: Sides = {}
@@ -64,7 +64,7 @@ def _describe_task(task: Task, sides: Sides) -> EnvManifest:
 
 
 def describe_vector(task: Task, env: Any, sides: Sides | None = None) -> EnvManifest:
-    """The manifest of a vector environment with a ``step`` of its own."""
+    """Describes a vector environment that has its own ``step``."""
     mode = compat.mode_of(env, dict(getattr(env, "metadata", None) or {}).get("autoreset_mode"))
     spaces = env if isinstance(env, SubEnvs) else task.vector_spaces({} if sides is None else sides)
     return EnvManifest(
@@ -88,7 +88,7 @@ def describe_vector(task: Task, env: Any, sides: Sides | None = None) -> EnvMani
 
 
 def _spec(env: Any) -> dict[str, Any] | None:
-    """What its spec says; without one, how long a ``TimeLimit`` lets an episode be."""
+    """Returns the facts of the spec; without a spec, the episode length of a ``TimeLimit``."""
     spec = None
     with suppress(Exception):  # Gymnasium's wrappers make it, of what the repository gave them
         spec = env.spec
@@ -115,14 +115,16 @@ def _interpreter() -> dict[str, str]:
 
 
 def _platform() -> str:
-    """As ``platform.platform()`` says it, which starts a process to find out."""
+    """Returns the text of ``platform.platform()`` without the process that this would start."""
     host = os.uname()
     libc = (os.confstr("CS_GNU_LIBC_VERSION") or "").replace(" ", "")
     return "-".join(filter(None, (host.sysname, host.release, host.machine, libc)))
 
 
 def _packages() -> dict[str, str]:
-    """Versions by name, from the heads of the metadata: all of it would be 60 ms and 6 MB."""
+    """Returns versions by name. Reads only the head of each metadata file: whole files would take
+    60 ms and 6 MB.
+    """
     versions: dict[str, str] = {}
     for folder in sys.path:
         for file in _metadata_in(folder):

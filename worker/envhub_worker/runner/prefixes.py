@@ -1,12 +1,12 @@
-"""What a runner says in front of its replies: what was warned of, and what has changed.
+"""Prefixes of a runner's replies: warnings, and changes of watched attributes.
 
-Python's own filters of warnings come first, as in any other process. What is heard is shown, too,
-as it was: it stands in what the jail prints. Followed: ``warnings.showwarning``.
+Python's own warning filters apply first, as in any other process. The runner also shows each
+warning as usual, so the jail's output has it. Followed: ``warnings.showwarning``.
 
-An evaluation asks for its task's description after every step, which costs as much as the step. So
-what is read again and again is looked at here after each request, and the client learns when it is
-something else. Only what can be looked at without running any code of the repository is watched:
-plain attributes with plain values, in a process with one thread that no signal runs anything in.
+An evaluation reads its task's description after every step, and a request for it costs as much as
+the step. So the runner compares such attributes after each request and tells the client which have
+changed. It watches only attributes that it can read without running the repository's code: plain
+attributes with plain values, in a process with one thread and no signal handlers.
 Followed: ``gymnasium.Wrapper.get_wrapper_attr``.
 """
 
@@ -48,14 +48,14 @@ _COLORS = re.compile("\x1b\\[[0-9;]*m")
 
 
 class WarningLog:
-    """What has been warned of. ``pending``, always the same list: what no reply has taken along."""
+    """Collects warnings. ``pending``, always the same list: those that no reply has carried yet."""
 
     def __init__(self) -> None:
         self.pending: list[RemoteWarning] = []
         self._heard: set[RemoteWarning] = set()
 
     def listen(self) -> None:
-        """Hear whatever is shown from now on, in any thread."""
+        """Collect every warning that any thread shows from now on."""
         show = warnings.showwarning
 
         def hear(
@@ -73,7 +73,7 @@ class WarningLog:
         warnings.showwarning = hear
 
     def note_shared(self, name: str) -> None:
-        """Sub-environments share what has this name in ``SHARED_STATE``."""
+        """Warn that sub-environments share state, which has this name in ``SHARED_STATE``."""
         self.pending.append((SHARED_CATEGORY, name))
 
     def _note(self, message: object, category: type) -> None:
@@ -89,7 +89,7 @@ class WarningLog:
             self.pending.append(warning)
 
     def in_front(self, frames: list[Any]) -> list[Buffer]:
-        """A reply's frames, with what is pending in front of them."""
+        """Puts the pending warnings in front of a reply's frames."""
         if not self.pending or len(frames) >= DEFAULT_LIMITS.frames:
             return frames
         some = self.pending[: WARNINGS.most]
@@ -111,7 +111,7 @@ _SIGNALS = tuple(
 
 
 def is_alone() -> bool:
-    """Whether this process has no other threads of Python's, and handlers of no signals."""
+    """Whether this process has only one Python thread and no signal handlers."""
     return not (_thread._count() or any(map(callable, map(_signal.getsignal, _SIGNALS))))
 
 
@@ -120,8 +120,9 @@ _Reading = tuple[Callable[[str], Any], Any]
 
 
 class Watches:
-    """What is watched of the environments of one runner: readings of each attribute.
-    ``changed``: what the client is to learn. Both are always the same dict.
+    """Watched attributes of one runner's environments.
+    ``readings``: the values of each; ``changed``: changes that the client does not know yet. Both
+    are always the same dict.
     """
 
     def __init__(self, alone: Callable[[], bool] = is_alone) -> None:
@@ -130,8 +131,8 @@ class Watches:
         self.changed: dict[Attribute, None] = {}
 
     def begin(self, number: int, env: Any, name: str, values: Any | None) -> bool:
-        """Watch an attribute whose values have just been read; whether that is possible.
-        ``values``: None where it is watched that no sub-environment has the attribute.
+        """Watch an attribute whose values were just read; returns whether that is possible.
+        ``values``: None if no sub-environment has the attribute, which is watched, too.
         """
         key = (number, name)
         self.readings.pop(key, None)
@@ -148,7 +149,7 @@ class Watches:
         return True
 
     def look(self) -> None:
-        """After a request: note what is something else than before, and watch it no more."""
+        """Note which attributes the last request has changed, and stop watching them."""
         alone = self._alone()
         for key, readings in list(self.readings.items()):
             if not (alone and _are(key[1], readings)):
@@ -156,15 +157,16 @@ class Watches:
                 self.changed[key] = None
 
     def forget(self, number: int) -> None:
-        """The environment is closed."""
+        """Forget an environment, which is closed."""
         for kept in (self.readings, self.changed):
             for key in [key for key in kept if key[0] == number]:
                 del kept[key]
 
     def in_front(self, frames: list[Any]) -> list[Buffer]:
-        """A reply's frames, with what has changed in front of them.
+        """Puts the changes in front of a reply's frames.
 
-        A reply that has no room for it says by that alone that anything may have changed.
+        A reply that already has the maximum number of frames has no room for them. The client takes
+        such a reply to mean that anything may have changed.
         """
         if not self.changed or len(frames) >= DEFAULT_LIMITS.frames:
             return frames
@@ -187,7 +189,7 @@ def _can_be_watched(env: Any, name: str, values: Any) -> bool:
 
 
 def _are(name: str, readings: list[_Reading]) -> bool:
-    """Whether everything is as it was."""
+    """Whether all readings still hold."""
     try:
         for read, before in readings:
             now = read(name)
@@ -199,7 +201,7 @@ def _are(name: str, readings: list[_Reading]) -> bool:
 
 
 def _has(env: Any, name: str) -> bool:
-    """Whether an environment or what it wraps has an attribute."""
+    """Whether an environment or one that it wraps has an attribute."""
     while not hasattr(env, name):
         if not isinstance(env, gym.Wrapper):
             return False
@@ -208,8 +210,8 @@ def _has(env: Any, name: str) -> bool:
 
 
 def _is_plain(env: Any, name: str) -> bool | None:
-    """Whether reading an attribute runs nothing but Gymnasium's own search through the wrappers.
-    None: likewise, and the search is in vain.
+    """Whether reading an attribute runs only Gymnasium's own search through the wrappers.
+    None: only that search runs, and it finds nothing.
     """
     while True:
         kind: Any = type(env)
@@ -227,6 +229,6 @@ def _is_plain(env: Any, name: str) -> bool | None:
 
 
 def _intercepts(kind: Any) -> bool:
-    """Whether a class has a say in what its attributes are."""
+    """Whether a class overrides attribute access."""
     own = kind.__getattribute__ is not object.__getattribute__
     return own or any("__getattr__" in vars(base) for base in kind.__mro__)

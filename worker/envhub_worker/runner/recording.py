@@ -1,12 +1,12 @@
 """Stand-ins for Gymnasium's vector classes while a repository's ``make_env`` runs.
 
-``SyncVectorEnv(...)`` and ``AsyncVectorEnv(...)`` then only write down their arguments. The runner
-builds the sub-environments that it needs and drives them itself, so a suite of many tasks costs
-nothing before it is used. The object is a real instance of its class: a look into it (by a
-wrapper, the repository itself) makes it build itself after all, and it is driven as it is.
+``SyncVectorEnv(...)`` and ``AsyncVectorEnv(...)`` then only record their arguments. The runner
+builds the sub-environments that it needs and steps them itself, so a suite of many tasks costs
+nothing before it is used. A recording is a real instance of its class: if a wrapper or the
+repository reads an attribute, it builds itself after all, and the runner steps it unchanged.
 
-Its end is no look: what was never built has nothing to close. Gymnasium's ``__del__`` asks for
-attributes, and would build all processes of every task that was not used, only to end them.
+Deleting or closing a recording does not build it: it has nothing to close. Gymnasium's ``__del__``
+reads attributes and would build all processes of every unused task, only to end them.
 
 Followed: ``gymnasium.vector.SyncVectorEnv.__init__`` and ``AsyncVectorEnv.__init__`` (0.26 to 1.4).
 """
@@ -31,7 +31,7 @@ from envhub_worker.runner.foreign import old_gym
 
 _KEY = "_envhub_recording"
 _ANSWERED = frozenset({"unwrapped", "spec", "closed", "close", "num_envs"})
-# arguments that change what the class does in ways the worker's own loop does not follow
+# Arguments whose effect the worker's own loop does not reproduce.
 _FOREIGN_ARGUMENTS = frozenset({"worker", "observation_space", "action_space"})
 
 
@@ -51,7 +51,7 @@ class Recording:
 
 
 def recording(env: object) -> Recording | None:
-    """The recording of a vector environment that was neither looked into nor closed, else None."""
+    """Returns the recording of a vector environment that is neither built nor closed, else None."""
     own = object.__getattribute__(env, "__dict__") if type(env) in _LAZY.values() else {}
     record = None if own.get("closed") else own.get(_KEY)
     return record if isinstance(record, Recording) else None
@@ -59,7 +59,7 @@ def recording(env: object) -> Recording | None:
 
 @contextmanager
 def standing_in() -> Iterator[None]:
-    """While it lasts, the two classes record instead of building."""
+    """A context in which the two classes record their arguments instead of building."""
     for cls, recorder in _RECORDERS.items():
         cls.__init__ = recorder
     try:
@@ -110,7 +110,7 @@ def _record(
 
 
 def _steps_all_at_once(arguments: dict[str, Any]) -> bool:
-    """Whether no ``max_concurrency`` holds sub-environments back: workers know of no others."""
+    """Whether no ``max_concurrency`` delays sub-environments, which the worker cannot do."""
     bound = arguments.get("max_concurrency")
     if bound is None:
         return True
@@ -119,7 +119,7 @@ def _steps_all_at_once(arguments: dict[str, Any]) -> bool:
 
 
 def _can_start(arguments: dict[str, Any]) -> bool:
-    """Whether ``context``, which is of no further use here, is a way to start processes."""
+    """Whether ``context`` names a start method of processes. It has no other use here."""
     context = arguments.get("context")
     return context is None or context in multiprocessing.get_all_start_methods()
 
@@ -147,7 +147,7 @@ def _adapted(env_fn: Callable[[], Any]) -> Any:
 def _lazy_class(cls: type[VectorEnv[Any, Any, Any]]) -> type:
     def __getattribute__(self: Any, name: str) -> Any:
         own = object.__getattribute__(self, "__dict__")
-        # what Python itself asks for, by names of its own, is no look either
+        # Python itself reads dunder attributes: these do not build a recording.
         if not name.startswith("__") and name not in _ANSWERED and name not in own:
             _build_after_all(self, cls)
             return getattr(self, name)
@@ -169,16 +169,16 @@ def _lazy_class(cls: type[VectorEnv[Any, Any, Any]]) -> type:
 
 
 def _end(self: Any) -> None:
-    """Nothing of it was ever started."""
+    """Replaces ``__del__``: a recording has started nothing."""
 
 
 def _close(self: Any, **kwargs: Any) -> None:
-    """As Gymnasium's ``close``, of what has nothing to close."""
+    """Replaces ``close``: marks a recording closed, which has nothing else to close."""
     self.__dict__["closed"] = True
 
 
 _CLASSES: tuple[Any, ...] = (SyncVectorEnv, AsyncVectorEnv)
 _LAZY: dict[Any, type] = {cls: _lazy_class(cls) for cls in _CLASSES}
 _REAL_INIT: dict[Any, Callable[..., None]] = {cls: cls.__init__ for cls in _LAZY}
-# here, where a zygote makes them once: what a signature is takes its time
+# Made at import, which a zygote does once for all runners: ``inspect.signature`` is slow.
 _RECORDERS = {cls: _recorder(cls, lazy) for cls, lazy in _LAZY.items()}

@@ -1,7 +1,7 @@
-"""What is wrong with a result that ``reset`` or ``step`` returned, and the line that returned it.
+"""Explains why a result of ``reset`` or ``step`` does not fit, and finds the line that returned it.
 
 Gymnasium writes results into arrays, and numpy's errors name neither the call nor the space. The
-call is over by then, so the line is read from the source: no environment is called a second time.
+call has returned by then, so this module finds the line in the source and calls nothing again.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ def misfit(
     space: gym.Space[Any],
     reward_shape: tuple[int, ...] = (),
 ) -> Exception:
-    """An error that says what does not fit, and where, in place of that of writing into a batch.
+    """Returns an error that says which part of a result does not fit, instead of numpy's error.
 
     Args:
-        index: The sub-environment's, counted over all workers.
-        result: Observation and info; of a step also reward, terminated and truncated between them.
+        index: The sub-environment's index, counted over all workers.
+        result: ``(observation, info)``, or ``(observation, reward, terminated, truncated, info)``.
         space: The observation space that the sub-environment had when it was made.
     """
     call = f"{method} of sub-environment {index} returned"
@@ -58,7 +58,7 @@ def misfit(
 def _misfits(
     call: str, env: Any, index: int, result: Sequence[Any], space: Any, shape: tuple[int, ...]
 ) -> Iterator[tuple[str, str]]:
-    """Which part of a result does not fit, and how."""
+    """Yields a description of each part of a result that does not fit."""
     observation, *numbers, info = result
     for reward in numbers[:1]:
         if not _fits(reward, shape, np.float64):
@@ -75,8 +75,8 @@ def _misfits(
 
 
 def misfit_in_vector(error: Exception, env: Any, method: str) -> Exception:
-    """The same for a vector environment of a class derived from Gymnasium's, if an observation of a
-    sub-environment does not fit.
+    """Like ``misfit``, for a vector environment of a class derived from Gymnasium's, if an
+    observation of one of its sub-environments does not fit.
     """
     with contextlib.suppress(Exception):
         for layer in _layers(env):
@@ -98,7 +98,7 @@ def _fits(value: Any, shape: tuple[int, ...], dtype: Any) -> bool:
 
 
 def parts(space: Any, value: Any, path: str = "") -> Iterator[tuple[str, Any, str]]:
-    """The parts of an observation that cannot be written: path, space and description of each."""
+    """Yields the parts of an observation that cannot be written: path, space and description."""
     keys: Any = ()
     if isinstance(space, spaces.Dict):
         keys = space.spaces
@@ -119,7 +119,7 @@ def parts(space: Any, value: Any, path: str = "") -> Iterator[tuple[str, Any, st
 
 
 def _changed(env: Any, space: Any) -> str:
-    """A clause about the environment's present space, if it differs from the first one."""
+    """Returns a clause about the environment's current space if it differs from the first one."""
     try:
         now = env.observation_space
         return "" if now == space else f", and has become {one_line(str(now), _SPACE_CHARS)}"
@@ -130,10 +130,11 @@ def _changed(env: Any, space: Any) -> str:
 def raised_at(
     error: Exception, env: Any, method: str, part: str = "", result: Sequence[Any] = ()
 ) -> Exception:
-    """The error with the line of the method's ``return`` at the end of its traceback.
+    """Returns the error with the line of the method's ``return`` at the end of its traceback.
 
-    The outermost layer whose code is neither ours nor Gymnasium's made the result. Of several
-    ``return`` the literals in them choose one; if they cannot, it is the method's first line.
+    The outermost layer whose code is neither ours nor Gymnasium's made the result. If the method
+    has several ``return`` statements, their literals decide which one it was; if these do not
+    decide, the error shows the method's first line.
     """
     with contextlib.suppress(Exception):  # it is an environment's, which may have any attribute
         for layer in _layers(env):
@@ -153,12 +154,12 @@ def _layers(env: Any) -> Iterator[Any]:
 
 
 def _passed_on(result: Sequence[Any]) -> Sequence[Any]:
-    """The result without what Gymnasium's wrappers may have changed: ``terminated`` alone stays."""
+    """Drops every part of a result that Gymnasium's wrappers may change: keeps ``terminated``."""
     return [value if at == 2 else ... for at, value in enumerate(result)]
 
 
 def _code(cls: type, method: str, part: str) -> CodeType | None:
-    """The author's code that made this part of a result, if it is the author's."""
+    """Returns the code that made this part of a result, unless it is Gymnasium's or ours."""
     converter = _CONVERTERS.get(part)
     converts = converter is not None and issubclass(cls, converter)
     for name in (method, part) if converts else (method,):
@@ -189,7 +190,7 @@ def _is_of(node: Any, code: CodeType) -> bool:
 
 
 def _returns(function: Any) -> Iterator[ast.Return]:
-    """The ``return`` statements of a function, without those of functions inside it."""
+    """Yields a function's ``return`` statements, without those of nested functions."""
     for node in ast.iter_child_nodes(function):
         if isinstance(node, ast.Return):
             yield node
@@ -198,7 +199,7 @@ def _returns(function: Any) -> Iterator[ast.Return]:
 
 
 def _may_be(node: Any, result: Sequence[Any]) -> bool:
-    """Whether no literal of an expression says that it has another result."""
+    """Whether an expression may have produced a result: none of its literals contradicts it."""
     if not isinstance(node, ast.Tuple) or len(node.elts) != len(result):
         return True
     return all(map(_is_like, node.elts, result))
@@ -211,7 +212,7 @@ def _is_like(node: Any, value: Any) -> bool:
 
 
 def _with_line(error: Exception, code: CodeType, line: int) -> Exception:
-    """An error whose traceback ends in this line, as if it had been raised there."""
+    """Returns an error whose traceback ends in a line, as if the line had raised it."""
     source = linecache.getline(code.co_filename, line).rstrip().encode()
     tree = ast.parse("raise error")
     for node in ast.walk(tree):  # all of the line, since Python 3.11 underlines a part

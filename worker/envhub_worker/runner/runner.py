@@ -1,7 +1,8 @@
-"""The runner: holds the live vector environments of one jail and answers for them.
+"""The runner: holds live vector environments of a jail and answers requests about them.
 
-One small function per message, found in a table. It speaks length-prefixed packets over one
-inherited stream, on the main thread (a repository may set signal handlers), and dies with it.
+A table maps each message to a small function. The runner exchanges length-prefixed packets over one
+inherited stream, on the main thread (a repository may set signal handlers), and ends with the
+stream.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
                 return 0
         elif ready:
             for lane in [bells[bell] for bell in ready]:
-                # one alone may wait awake for the next request: others would wait for that
+                # Only a single lane may poll for its next request: it would block other lanes.
                 if not lane.wake(alone=len(bells) == 1):
                     runner.forget_lane(lane)
         else:
@@ -73,12 +74,13 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
                 lane.serve()
         if list(bells.values()) != list(runner.lanes.values()):
             bells = _hear(poller, bells, runner.lanes.values())
-        # a request may cross with our going to sleep: look again soon, once
+        # A request may come while we go to sleep: its client may still read that we are awake, and
+        # not ring. So the first sleep is short, and its end looks at every lane.
         timeout = _RECHECK_MS if ready and bells else None
 
 
 def _hear(poller: select.poll, bells: Collection[int], lanes: Collection[Lane]) -> dict[int, Lane]:
-    """Listen to the doorbells of these lanes, and no others any more."""
+    """Watch the doorbells of these lanes only; returns lanes by doorbell."""
     for bell in bells:
         poller.unregister(bell)
     for lane in lanes:
@@ -87,7 +89,7 @@ def _hear(poller: select.poll, bells: Collection[int], lanes: Collection[Lane]) 
 
 
 def _serve(stream: socket.socket, reader: StreamReader, runner: Runner) -> bool:
-    """Answer what has come; False at the end of the stream."""
+    """Answer the requests that have arrived; returns False at the end of the stream."""
     data, ancillary, _, _ = stream.recvmsg(reader.chunk, _ANCILLARY_BYTES)
     runner.descriptors = [fd for part in ancillary for fd in array("i", part[2])]
     for packet in reader.feed(data):
@@ -130,11 +132,11 @@ class Runner:
         self.descriptors: list[int] = []
 
     def answer(self, packet: Packet) -> list[Any]:
-        """The reply's frames, with what is to be said of other things in front of them."""
+        """Returns the reply's frames, with warnings and changes in front of them."""
         return self.watches.in_front(self.warned.in_front(self.reply(packet)))
 
     def reply(self, packet: Packet) -> list[Any]:
-        """The reply's frames; whatever the repository raises becomes ``RaisedException``."""
+        """Returns the reply's frames; an error of the repository becomes ``RaisedException``."""
         request = self.read(packet.frames)
         lane = self.lanes.get(getattr(request, "env", -1))
         if lane is not None:
@@ -145,9 +147,9 @@ class Runner:
         return self._reply_to(request)
 
     def read(self, frames: list[Any]) -> m.Message:
-        """A request; where it cannot be read, the answer to it."""
+        """Decodes a request; returns ``RaisedException``, its answer, if that fails."""
         try:
-            # the caller's own arguments may be pickled: this is the only place that unpickles
+            # The caller's own arguments may be pickled. Only this line unpickles.
             return m.unpack(frames, unpickler=cloudpickle.loads)
         except Exception as error:  # of a class that is not to be had here, for instance
             return raised(error, "arguments")
@@ -155,7 +157,9 @@ class Runner:
     def _reply_to(
         self, request: m.Message, written: Callable[[m.Message], bool] | None = None
     ) -> list[Any]:
-        """As ``reply``; to the lane's request, which may have ``written`` the reply: then none."""
+        """Like ``reply``, for a decoded request. Returns no frames if ``written``, the lane's own
+        writer, has written the reply.
+        """
         self._stage = type(request).__name__.lower()
         try:
             reply = _HANDLERS[type(request)](self, request)
@@ -175,7 +179,7 @@ class Runner:
                 self.watches.look()
 
     def load(self, request: m.Load) -> m.Message:
-        """Import the repository, call ``make_env``, describe what came back."""
+        """Import the repository, call ``make_env`` and describe the result."""
         latest = monotonic() + request.play_ms / 1000
         tasks = self._load(request)
         budget = Budget(min(latest, monotonic() + _PLAY_S), self._play_bytes)
@@ -186,7 +190,7 @@ class Runner:
         return m.LoadDone(encode_manifest(made))
 
     def load_task(self, request: m.LoadTask) -> m.Message:
-        """Import the repository, call ``make_env``, and describe nothing: it is known."""
+        """Import the repository and call ``make_env``; the client has the description already."""
         self._load(request)
         task = self._tasks.get((request.suite, request.task))
         return m.Value(None if task is None else (task.num_envs, task.recording is not None))
@@ -239,7 +243,7 @@ class Runner:
         return _step_done(env, env.run_step(request.actions))
 
     def revive(self, request: m.Revive) -> m.Message:
-        """Begin anew in the place of sub-environments that died: see ``m.Revive``."""
+        """Reset sub-environments that replace dead ones: see ``m.Revive``."""
         env = self._envs[request.env]
         if isinstance(env, SubEnvs):
             return _step_done(env, env.run_revive(request.seeds))
@@ -270,29 +274,29 @@ class Runner:
         return m.Value(True)
 
     def forget_lane(self, lane: Lane) -> None:
-        """The client has closed it, or its environment."""
+        """Close a lane, after the client has closed it or its environment."""
         del self.lanes[lane.number]
         lane.close()
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:
-        """The last step's infos, which did not fit the slab."""
+        """Returns the last step's infos, which did not fit into the slab."""
         lane = self.lanes.get(request.env)
         return m.Value({} if lane is None else lane.infos())
 
     def fetch_infos_apart(self, request: m.FetchInfosApart) -> m.Message:
-        """The last reset's or step's infos, as each sub-environment gave them."""
+        """Returns the last reset's or step's infos as each sub-environment returned them."""
         env = self._envs[request.env]
         if not isinstance(env, SubEnvs):
             return m.Value(())
         if request.failed:
             env.forget_ends()
             return m.Value(())
-        # arrays without their class, as in a column: a masked one would be a text
+        # Arrays lose their class, as in a column; a masked array would arrive as text.
         each = ((index, taken(info), batches.forms_of(info)) for index, info in env.pairs)
         return m.Value(tuple(each))
 
     def take_apart(self, request: m.TakeApart) -> m.Message:
-        """Infos are sent as each sub-environment gives them from now on."""
+        """Send each sub-environment's own infos from now on."""
         self._envs[request.env].apart = True
         return m.Value(None)
 
@@ -302,8 +306,8 @@ class Runner:
         return m.Value(tuple(results) if isinstance(results, list) else results)
 
     def watch(self, request: m.Watch) -> m.Message:
-        """``VectorEnv.call`` without arguments, and from now on its answer is watched; none where
-        no sub-environment has the attribute.
+        """``VectorEnv.call`` without arguments, and watch its result from now on; the result is
+        None if no sub-environment has the attribute.
         """
         number, name = request.env, request.name
         if self.watches.begin(number, self._envs[number], name, None):
@@ -327,22 +331,22 @@ class Runner:
         return m.Value(self._envs[request.env].render())
 
     def get_own(self, request: m.GetOwn) -> m.Message:
-        """An attribute of the vector environment, or of what it wraps."""
+        """Returns an attribute of the vector environment, or of one that it wraps."""
         value = _own(self._envs[request.env], request.name)
         return m.Method() if callable(value) else m.Value(value)
 
     def call_own(self, request: m.CallOwn) -> m.Message:
-        """A method of the vector environment, or of what it wraps."""
+        """Calls a method of the vector environment, or of one that it wraps."""
         method = _own(self._envs[request.env], request.name)
         return m.Value(method(*request.args, **request.kwargs))
 
     def get_one(self, request: m.GetOne) -> m.Message:
-        """An attribute of one sub-environment."""
+        """Returns an attribute of one sub-environment."""
         value = None if request.index is None else self._found(request)
         return m.Method() if callable(value) else m.Value(value)
 
     def call_one(self, request: m.CallOne) -> m.Message:
-        """A method of one sub-environment."""
+        """Calls a method of one sub-environment."""
         if request.index is None:
             return m.Value(None)
         return m.Value(self._found(request)(*request.args, **request.kwargs))
@@ -373,12 +377,12 @@ class Runner:
             ) from None
 
     def get_random(self, request: m.GetRandom) -> m.Message:
-        """The states of the random number generators: of all sub-environments, or just one."""
+        """Returns the states of the sub-environments' generators, or of the only generator."""
         own = self._generators.setdefault(request.env, generators.Generators())
         return m.Value(own.states(self._envs[request.env]))
 
     def set_random(self, request: m.SetRandom) -> m.Message:
-        """Bring those generators to other states, or put others in their places."""
+        """Set the generators to other states, or replace them."""
         put = generators.replace if request.new else generators.bring
         put(self._envs[request.env], request.states)
         return m.Value(None)
@@ -396,7 +400,7 @@ class Runner:
 
 
 def _call_own(env: Any, method: str, *args: Any, **kwargs: Any) -> Any:
-    """A method of the repository's own vector environment."""
+    """Calls a method of the repository's own vector environment."""
     try:
         return getattr(env, method)(*args, **kwargs)
     except (IndexError, KeyError, TypeError, ValueError) as error:
@@ -407,7 +411,7 @@ def _call_own(env: Any, method: str, *args: Any, **kwargs: Any) -> Any:
 
 
 def _restored(env: Any, actions: Any) -> Any:
-    """Actions with the classes that Gymnasium gives their members."""
+    """Gives actions the classes that Gymnasium gives them."""
     single, batched = (getattr(env, name, None) for name in ("single_action_space", "action_space"))
     if single is None or not batches.restores(single):
         return actions
@@ -423,13 +427,13 @@ def _step_done(env: SubEnvs, pairs: Pairs) -> m.Message:
 
 
 def _scratch() -> str:
-    """A folder of the jail's own: its home, unless the caller has granted another one's name."""
+    """Returns a folder of the jail's own: its home, unless the caller's HOME names another."""
     home = os.environ.get("HOME", "")
     return home if os.access(home, os.W_OK | os.X_OK) else os.getcwd()
 
 
 def _caller(env: Any) -> Callable[..., Any]:
-    """``env.call``, or for a vector environment without one, its own attribute."""
+    """Returns ``env.call``; for a vector environment without it, a read of its own attribute."""
     forwarded = _forwarded(env, "call")
     if forwarded is not None:
         return forwarded
@@ -442,7 +446,7 @@ def _caller(env: Any) -> Callable[..., Any]:
 
 
 def _forwarded(env: Any, name: str) -> Callable[..., Any] | None:
-    """Its method, or that of what it wraps: ``VectorWrapper`` has no ``call`` of its own."""
+    """Returns the outermost layer's method of this name: ``VectorWrapper`` forwards no ``call``."""
     for _ in range(_MOST_WRAPPERS):
         if hasattr(env, name):
             return getattr(env, name)  # type: ignore[no-any-return]

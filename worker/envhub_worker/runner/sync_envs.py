@@ -5,9 +5,9 @@ Everything but ``reset`` and ``step`` is ``SyncVectorEnv``'s own. The parity sui
 bit by bit. Followed: ``gymnasium.vector.SyncVectorEnv`` 1.4.
 
 ``FreezingEnv`` is for LeRobot's rollouts, which step all sub-environments until the last one is
-done, and drop what the finished ones give. Newer releases announce a rollout in the options of
-``reset``. From then on a finished sub-environment repeats its last transition, with reward 0, until
-the next rollout is announced; a frame of it is drawn once. Followed:
+done and drop the later results of finished ones. Newer releases announce a rollout in the options
+of ``reset``. From then on a finished sub-environment repeats its last transition, with reward 0,
+until the next rollout is announced; it renders its last frame once. Followed:
 ``lerobot.envs.utils.FreezeAfterEpisodeEnd`` 0.6, whose results these are.
 """
 
@@ -47,7 +47,7 @@ def announces_rollout(options: Any) -> bool:
 
 
 class FreezingEnv:
-    """One sub-environment, as far as it is driven."""
+    """Wraps a sub-environment's ``reset``, ``step`` and ``render``: it freezes at the end."""
 
     def __init__(self, env: Any) -> None:
         self._env = env
@@ -55,14 +55,14 @@ class FreezingEnv:
         self._frame: Any = None
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        """As ``Env.reset``, but the last observation and info of what has ended."""
+        """Like ``Env.reset``; once frozen, returns the last observation and info instead."""
         if self._last is not None and not announces_rollout(options):
             return self._last[0], self._last[4]
         self._last = self._frame = None
         return self._env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> Any:
-        """As ``Env.step``, but the last transition of what has ended."""
+        """Like ``Env.step``; once frozen, returns the last transition instead."""
         if self._last is not None:
             return self._last
         result = self._env.step(action)
@@ -72,7 +72,7 @@ class FreezingEnv:
         return result
 
     def render(self) -> Any:
-        """As ``Env.render``, but once of what has ended, if that is an image."""
+        """Like ``Env.render``; once frozen, renders an image once and repeats it."""
         if self._frame is not None:
             return self._frame
         frame = self._env.render()
@@ -85,14 +85,14 @@ Store = Callable[[int, Any], None]
 
 
 class Batch:
-    """Where the results of one batch lie: arrays of its own, or views of a slab.
+    """The memory for the results of one batch: its own arrays, or views of a slab.
 
     Attributes:
         rewards: float64 ``(count, *reward_shape)``.
         terminations, truncations: bool ``(count,)``.
         store: Writes a sub-environment's observation into its row.
-        rows: Where each observation goes as it is, if its dtype and shape are the row's; None
-            each where the space is no array.
+        rows: A view of each sub-environment's row, for observations of its dtype and shape; None
+            for each if the space is no array.
     """
 
     def __init__(self, space: gym.Space[Any], count: int, reward_shape: tuple[int, ...]) -> None:
@@ -118,7 +118,7 @@ class Batch:
         self._members[index] = member
 
     def write_to(self, slots: list[list[Any]]) -> None:
-        """Write observations into these leaves from now on: one list for each slot."""
+        """Write observations into these leaves from now on, one list of leaves per slot."""
         self._slots = [
             (leaves, _writer(self._space, iter(leaves)), self._rows_of(leaves)) for leaves in slots
         ]
@@ -130,7 +130,7 @@ class Batch:
         return [leaves[0][index, ...] for index in range(self._count)]
 
     def choose(self, slot: int, *, carry: bool = False) -> None:
-        """Write the next observations into another slot; ``carry`` takes the last ones along."""
+        """Write the next observations into another slot; ``carry`` copies the last ones there."""
         if slot != self._slot:
             self._left = self._slot
         self._slot = slot
@@ -139,25 +139,25 @@ class Batch:
         _, self.store, self.rows = self._slots[slot]
 
     def carry(self, start: int) -> None:
-        """Take the rows from ``start`` on along from the slot that was left, if one was."""
+        """Copy the rows from ``start`` on from the previous slot, if the slot has changed."""
         left, self._left = self._left, None
         if left is not None:
             for ours, theirs in zip(self._slots[self._slot][0], self._slots[left][0], strict=True):
                 ours[start:] = theirs[start:]
 
     def stay(self) -> None:
-        """All rows have been written: what was left is of no concern any more."""
+        """Forget the previous slot, since all rows have been written."""
         self._left = None
 
     def observation(self) -> Any:
-        """The batched observation; views of the arrays that the next step writes."""
+        """Returns the batched observation: views of arrays that the next step overwrites."""
         if self._slots:
             return slabs.assembler(self._space)(self._slots[self._slot][0])
         empty: Any = create_empty_array(self._space, n=self._count, fn=np.zeros)
         return concatenate(self._space, self._members, empty)
 
     def members(self) -> list[Any]:
-        """The observation of each."""
+        """Returns each sub-environment's observation."""
         if not self._slots:
             return list(self._members)
         batched = batch_space(self._space, self._count)
@@ -165,20 +165,20 @@ class Batch:
 
 
 class SubEnvs(SyncBase):  # type: ignore[misc]
-    """Plain sub-environments, driven with ``SyncVectorEnv``'s semantics.
+    """Plain sub-environments, stepped with ``SyncVectorEnv``'s semantics.
 
     Attributes:
-        batch: Where ``reset`` and ``step`` leave their results.
-        reward_shape: Of one sub-environment's reward; ``()`` but for multi-objective ones.
-        sliced: Whether there are others elsewhere, in other processes.
-        apart: Whether infos are sent as each sub-environment gave them.
-        pairs: The infos of the last reset or step, as each sub-environment gave them.
-        driven: What is reset, stepped and drawn: ``envs``, or what freezes them.
-        integers: Which discrete members of its last observation are Python's; () unless it is the
-            only one, ``apart``.
-        reward: A tuple with the last reward, if that is no number; likewise.
-        shared: What they share of a process, looked at after each reset and step; None where that
-            is as it should be.
+        batch: The memory that ``reset`` and ``step`` write their results into.
+        reward_shape: Shape of one sub-environment's reward; not ``()`` for multi-objective ones.
+        sliced: Whether other processes hold the rest of the vector environment.
+        apart: Whether each sub-environment's own infos are sent, not joined ones.
+        pairs: Each sub-environment's own infos of the last reset or step.
+        driven: The objects to reset, step and render: ``envs``, or a ``FreezingEnv`` for each.
+        integers: Which discrete parts of the last observation are Python ints. Only kept for a
+            single environment (``_single``).
+        reward: A tuple with the last reward if it is no number. Only kept for a single environment.
+        shared: Checks, after each reset and step, the state that the process's sub-environments
+            share; None if they may share it.
     """
 
     def __init__(
@@ -248,9 +248,10 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         return infos
 
     def run_revive(self, seeds: Any) -> Pairs:
-        """Reset all in the place of others, whose episodes are truncated; returns the infos.
+        """Reset all, in place of dead sub-environments whose episodes end; returns the infos.
 
-        Their last observations died with them: the fresh ones stand for those, too.
+        The episodes are truncated. The last observations died with the sub-environments: the new
+        observations replace those, too.
         """
         infos = self.run_reset(seeds, None, None)
         self.batch.rewards[...] = 0.0
@@ -270,8 +271,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         return infos
 
     def run_step(self, actions: Any) -> Pairs:
-        """Step every sub-environment, or reset it where its episode is over; returns the infos.
-        Rows of the batch of actions are handed out as they are.
+        """Step every sub-environment, or reset it if its episode is over; returns the infos.
+        Each sub-environment gets its row of the batch of actions unchanged.
         """
         batch, same_step, count = self.batch, self._mode == "SameStep", self.num_envs
         store, rows, rewards = batch.store, batch.rows, batch.rewards
@@ -350,16 +351,16 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
 
     @property
     def _single(self) -> bool:
-        """Whether it stands for a single environment, whose results are its own to the class."""
+        """Whether the client shows a single environment, whose results must keep their classes."""
         return self.apart and self.num_envs == 1 and not self.sliced
 
     @property
     def resets_nothing(self) -> bool:
-        """Whether an episode that has ended stays so until a reset is asked for."""
+        """Whether an ended episode stays ended until the caller asks for a reset."""
         return self._mode == "Disabled"
 
     def _check_info(self, info: Any) -> None:
-        """Raise ``TypeError`` if ``VectorEnv._add_info`` cannot take it."""
+        """Raise ``TypeError`` if ``VectorEnv._add_info`` cannot take an info."""
         empty = self._single and not info  # nothing is joined, and None says as much as {}
         if not empty and not hasattr(info, "items"):
             raise TypeError("the info is no dict")
@@ -367,7 +368,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
     def _refuse(
         self, error: Exception, index: int, method: str, result: Sequence[Any] = ()
     ) -> NoReturn:
-        """Raise what a call has raised, or what is wrong with the result that it returned."""
+        """Raise a call's error with an explanation, or an error about the result of the call."""
         env = self.envs[index]
         if result:
             declared = self.single_observation_space, self.reward_shape
@@ -379,25 +380,25 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         raise told from None
 
     def render(self) -> Any:
-        """One frame each."""
+        """Returns one frame per sub-environment."""
         return super().render() if self.driven is self.envs else self.call("render")
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
-        """As ``SyncVectorEnv.call``."""
+        """Like ``SyncVectorEnv.call``, but frozen sub-environments repeat their last frame."""
         if name == "render" and self.driven is not self.envs and not (args or kwargs):
             return tuple(one.render() for one in self.driven)
         return super().call(name, *args, **kwargs)
 
     def freezing_method(self, index: int, name: str) -> Any:
-        """``reset``, ``step`` or ``render`` of one, where it freezes at the end; else None."""
+        """Returns ``reset``, ``step`` or ``render`` of a ``FreezingEnv``; None without one."""
         freezes = self.driven is not self.envs and name in DRIVES
         return getattr(self.driven[index], name) if freezes else None
 
     def joined(self, pairs: Pairs) -> dict[Any, Any]:
-        """Infos of these sub-environments as they are sent: as one, or apart.
+        """Returns infos in the form in which they are sent: joined, or apart.
 
-        What does not go together in a slice may do so elsewhere, where another sub-environment is
-        the first: then they have to be asked for one by one.
+        Infos that do not join in this slice may join in the whole batch, where another
+        sub-environment is the first. The client then asks for each sub-environment's own.
         """
         if self.apart:
             infos: dict[Any, Any] = {}
@@ -418,22 +419,23 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             raise
 
     def forget_ends(self) -> None:
-        """The infos cannot be joined: ``SyncVectorEnv`` fails before it notes what has ended."""
+        """Undo the note of ended episodes after a failed join, before which ``SyncVectorEnv`` would
+        not have noted them.
+        """
         if self._sync:
             self._done = self._done_before
 
     def _copier(self) -> Callable[[Any], Any] | None:
-        """What keeps an info as it is, where a sibling that comes next may fill the same."""
+        """Returns a function that copies an info if a sibling may fill the same object next."""
         if not self._siblings:
             return None
         return kept if self.apart else taken
 
     def _final(self, observation: Any, info: Any) -> dict[str, Any]:
-        """What is said of the end of an episode, before the reset that may overwrite it.
+        """Returns the final observation and info of an episode, before a reset may overwrite them.
 
-        A single environment's is that end's. Of several it is what the class gives that the
-        repository asked for: ``SyncVectorEnv`` copies ``final_info`` here, and ``AsyncVectorEnv``
-        nothing.
+        For a single environment both are copied. For several the copies are those of the class that
+        the repository asked for: ``SyncVectorEnv`` copies ``final_info``, ``AsyncVectorEnv`` none.
         """
         if self.apart:
             return {"final_obs": kept(observation), "final_info": kept(info)}
@@ -449,7 +451,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
 
 
 def _reward_shape(env: Any) -> tuple[int, ...]:
-    """MO-Gymnasium's environments declare a ``reward_space``."""
+    """Returns the shape of ``reward_space``, which MO-Gymnasium's environments declare."""
     try:
         return tuple(env.get_wrapper_attr("reward_space").shape)
     except (AttributeError, TypeError):
@@ -457,7 +459,7 @@ def _reward_shape(env: Any) -> tuple[int, ...]:
 
 
 def _writer(space: gym.Space[Any], leaves: Iterator[Any]) -> Store:
-    """Writes one member of the space into row ``index`` of the leaves."""
+    """Returns a function that writes a member of the space into row ``index`` of the leaves."""
     if isinstance(space, spaces.Dict):
         by_key = [(key, _writer(sub, leaves)) for key, sub in space.spaces.items()]
 

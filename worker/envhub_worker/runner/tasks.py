@@ -1,7 +1,8 @@
-"""Brings whatever ``make_env`` returned into one form: tasks by suite and task id.
+"""Brings the result of ``make_env`` into one form: tasks by suite and task id.
 
-Followed: LeRobot's ``_normalize_hub_result``, and what it gets wrong: a single ``Env`` with
-``n_envs > 1``, ``{suite: VectorEnv}``, ``{suite: [env, ...]}``, duck-typed vector environments.
+Followed: LeRobot's ``_normalize_hub_result``. This module also handles results that LeRobot gets
+wrong: a single ``Env`` with ``n_envs > 1``, ``{suite: VectorEnv}``, ``{suite: [env, ...]}``,
+duck-typed vector environments.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class Task:
 
     @property
     def may_share(self) -> bool:
-        """Whether sub-environments that ask for processes of their own may have to share one."""
+        """Whether sub-environments of an ``AsyncVectorEnv`` may have to share a process."""
         return self.recording is not None and not self.recording.sync and self.num_envs > 1
 
     @property
@@ -64,7 +65,7 @@ class Task:
         return len(self.recording.env_fns) if self.recording else int(self.vector.num_envs)
 
     def build(self, start: int, stop: int) -> Any:
-        """A vector environment of the sub-environments ``start`` to ``stop``."""
+        """Builds a vector environment of the sub-environments ``start`` to ``stop``."""
         if self.recording is None:
             return self.vector
         envs = [self._first_or_new(index) for index in range(start, stop)]
@@ -77,7 +78,7 @@ class Task:
         )
 
     def _refuse_differing(self, envs: list[Any], start: int) -> None:
-        """Raise what Gymnasium raises of sub-environments with different spaces."""
+        """Raise Gymnasium's error if the sub-environments have different spaces."""
         assert self.recording is not None
         sync, pairs = self.recording.sync, [_spaces_of(env) for env in envs]
         text = differing(sync, pairs)
@@ -87,14 +88,14 @@ class Task:
             raise RuntimeError(text)
 
     def learn_spaces(self) -> Any:
-        """One sub-environment of a recording, to read spaces and metadata from."""
+        """Returns one sub-environment of a recording, to read spaces and metadata from."""
         if self.probe is None:
             self.probe = self.build_one(0)
         return self.probe
 
     def vector_spaces(self, sides: Sides) -> VectorSpaces:
-        """The spaces of a live environment.
-        Raises ``ResultError``: they are neither declared nor to be seen.
+        """Returns the spaces of a live environment.
+        Raises ``ResultError``: it neither declares them nor shows them in its first reset.
         """
         if self.spaces is None:
             try:
@@ -113,12 +114,12 @@ class Task:
         return first
 
     def build_one(self, index: int) -> Any:
-        """A new sub-environment, as one of Gymnasium's."""
+        """Builds a sub-environment, adapted to Gymnasium's interface."""
         assert self.recording is not None
         return old_gym.adapted(self.recording.env_fns[index]())
 
     def forget_probe(self) -> None:
-        """Close the sub-environment that was built for its spaces."""
+        """Close the sub-environment that ``learn_spaces`` built."""
         if self.probe is not None:
             self.probe.close()
             self.probe = None
@@ -133,9 +134,9 @@ def _spaces_of(env: Any) -> Pair:
 
 
 def tasks_of(result: Any, n_envs: int, use_async_envs: bool, again: EnvFn) -> list[Task]:
-    """The tasks in ``make_env``'s result.
+    """Returns the tasks in the result of ``make_env``.
 
-    ``again`` calls ``make_env`` with ``n_envs=1``, for one more single ``Env``.
+    ``again`` calls ``make_env`` with ``n_envs=1`` to get one more single ``Env``.
     Raises ``ResultError``: the result, or something in it, is not an environment.
     """
     make = _Maker(n_envs, use_async_envs, again)
@@ -238,15 +239,15 @@ def _is_duck(env: Any) -> bool:
 
 
 def _has_single_spaces(env: Any) -> bool:
-    """Whether a ``gym.Env`` is a vector environment but for its base, as a simulator's often is."""
+    """Whether a ``gym.Env`` is a vector environment without that base, as in many simulators."""
     names = ("num_envs", "single_observation_space", "single_action_space")
     return isinstance(env, gym.Env) and all(hasattr(env, name) for name in names)
 
 
 def _refuse_batched(env: Any) -> None:
-    """Raise ``ResultError`` if it, or what it wraps, steps several environments at once.
+    """Raise ``ResultError`` if an ``Env`` or a layer of it steps several environments at once.
 
-    A vector of it would have a dimension too many, and neither library would say so.
+    A vector of such environments would have one dimension too many without any error.
     """
     for layer in compat.layers(env):
         count = getattr(layer, "num_envs", None)
@@ -261,7 +262,7 @@ def _refuse_batched(env: Any) -> None:
 
 
 def _is_batched(env: Any, count: int) -> bool:
-    """Whether its spaces are of so many. One may be a channel: then both have to be."""
+    """Whether the spaces are batched. A dimension of 1 may be a channel: then both must have it."""
     own = (old_gym.space_of(getattr(env, name)) for name in _SPACES)
     observed, acted = (row_of(space, count) is not None for space in own)
     return observed and (acted or count > 1)

@@ -1,10 +1,10 @@
-"""The spaces of a vector environment with a ``step`` of its own: as declared, or as its first reset
-shows them.
+"""Finds the spaces of a vector environment that has its own ``step``: the declared ones, or those
+that its first reset shows.
 
 A class without Gymnasium's base often has ``action_space`` alone, or the same space under both
-names: LeRobot's lazy vector environment that of one sub-environment, Isaac Lab Arena that of the
-whole batch. The *side* of such a space is what the first reset observes: True where it is the
-batch's, False where it is of one sub-environment, None where the observation fits neither.
+names: LeRobot's lazy vector environment has the space of one sub-environment there, Isaac Lab Arena
+that of the batch. The first observation decides the *side* of such a space: True if it is the
+batch's, False if it is one sub-environment's, None if the observation fits neither.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ Sides = dict[Any, bool]
 
 
 class MissingSpaceError(Exception):
-    """Neither declared nor shown by an observation: the text is the attribute to add."""
+    """A space is neither declared nor shown by an observation; the text is the attribute to add."""
 
 
 @dataclass(frozen=True)
 class VectorSpaces:
-    """What a manifest says of spaces."""
+    """The spaces for a manifest."""
 
     single_observation_space: Space
     observation_space: Space
@@ -41,8 +41,8 @@ class VectorSpaces:
 
 
 def spaces_of(env: Any, sides: Sides) -> VectorSpaces:
-    """The spaces of a vector environment. It is reset where what it declares does not tell.
-    Raises ``MissingSpaceError``: nor does its reset.
+    """Returns the spaces of a vector environment; resets it if its declarations are not enough.
+    Raises ``MissingSpaceError``: the reset does not show them either.
     """
     count = int(env.num_envs)
     observed, acted = _declared(env, "observation_space"), _declared(env, "action_space")
@@ -62,7 +62,7 @@ def spaces_of(env: Any, sides: Sides) -> VectorSpaces:
 
 
 def row_of(space: Space, count: int) -> Space | None:
-    """The space of one row of a batched space; None where it is no batch of so many."""
+    """Returns the space of one row of a batched space; None if it is no batch of ``count``."""
     if isinstance(space, spaces.Dict):
         rows = {key: row_of(sub, count) for key, sub in space.spaces.items()}
         shown = {key: row for key, row in rows.items() if row is not None}
@@ -84,7 +84,7 @@ def row_of(space: Space, count: int) -> Space | None:
 
 
 def _row_of_tuple(space: spaces.Tuple[Any], count: int) -> Space | None:
-    """A tuple of batches, or of one space for each."""
+    """Returns the row space of a tuple of batches, or of a tuple with a space per row."""
     rows = [row_of(sub, count) for sub in space.spaces]
     shown = [row for row in rows if row is not None]
     if rows and len(shown) == len(rows):
@@ -94,7 +94,7 @@ def _row_of_tuple(space: spaces.Tuple[Any], count: int) -> Space | None:
 
 
 def _declared(env: Any, name: str) -> tuple[Space | None, Space | None]:
-    """The space of one sub-environment, and that of all of them."""
+    """Returns the declared spaces: one sub-environment's, and the batch's."""
     single, batched = getattr(env, f"single_{name}", None), getattr(env, name, None)
     if single is batched is None:
         members = getattr(env, "envs", None)
@@ -105,7 +105,7 @@ def _declared(env: Any, name: str) -> tuple[Space | None, Space | None]:
 
 
 def _is_open(single: Space | None, batched: Space | None) -> bool:
-    """Whether these do not say which side they are on."""
+    """Whether the declared spaces leave open which side they are on."""
     if single is None or batched is None:
         return single is None
     forms = _forms(batched)
@@ -113,7 +113,7 @@ def _is_open(single: Space | None, batched: Space | None) -> bool:
 
 
 def _forms(space: Space) -> list[Any]:
-    """What a space and a batch of it never have in common; nothing, if no array is in it."""
+    """Returns what tells a space from a batch of it: shapes of arrays, classes of other spaces."""
     if isinstance(space, spaces.Dict):
         return [(key, form) for key, sub in space.spaces.items() for form in _forms(sub)]
     if isinstance(space, spaces.Tuple):
@@ -124,7 +124,7 @@ def _forms(space: Space) -> list[Any]:
 def _settled(
     single: Space | None, batched: Space | None, side: bool | None, count: int
 ) -> tuple[Space, Space]:
-    """The space of one sub-environment and that of the batch."""
+    """Returns the space of one sub-environment and that of the batch, once the side is known."""
     if single is None:
         assert batched is not None
         row = row_of(batched, count) if side else None
@@ -135,7 +135,7 @@ def _settled(
 
 
 def _looks_batched(space: Space, count: int) -> bool:
-    """Whether it is a batch as far as its shape tells; a Box of one number alone is not likely."""
+    """Whether a space's shape is a batch's. A Box whose rows are single numbers is unlikely one."""
     row = row_of(space, count)
     return row is not None and () not in [
         leaf.shape for leaf in _leaves(row) if isinstance(leaf, spaces.Box)
@@ -171,7 +171,7 @@ def _first_observation(env: Any) -> Any:
 
 
 def _votes(space: Space, value: Any, count: int) -> Iterator[bool | None]:
-    """Of each leaf, whether the value is a member of it, or so many members."""
+    """Yields for each leaf whether the value is one member of it, or ``count`` members."""
     if isinstance(space, spaces.Dict):
         fits = isinstance(value, Mapping) and all(key in value for key in space.spaces)
         for key, sub in space.spaces.items():
@@ -188,7 +188,7 @@ def _votes(space: Space, value: Any, count: int) -> Iterator[bool | None]:
 
 
 def _space_of(value: Any, count: int) -> Space | None:
-    """The space of one row of a batch of observations; None where it is no batch of numbers."""
+    """Returns the space of one row of a batch of observations; None if they are not numeric."""
     if isinstance(value, Mapping):
         rows = {key: _space_of(item, count) for key, item in value.items()}
         shown = {key: row for key, row in rows.items() if row is not None}

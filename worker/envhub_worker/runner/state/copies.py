@@ -1,4 +1,4 @@
-"""Copies of what an environment returned, made before it, or a sibling, is called again.
+"""Copies of an environment's results, made before it or a sibling is called again.
 
 Many environments fill one mapping or one array again and again.
 """
@@ -17,9 +17,10 @@ _FLAT |= {np.dtype(char).type for char in "bBhHiIlLqQefd"}
 
 
 def taken(info: dict[Any, Any], depth: int = _DEPTH) -> dict[Any, Any]:
-    """What ``VectorEnv._add_info`` takes at once of an info: the mappings and arrays in it.
+    """Copies the mappings and arrays of an info, which ``VectorEnv._add_info`` copies, too.
 
-    Other objects, and a ``final_obs``, it refers to: they are what they are when they are sent.
+    Gymnasium keeps references to other objects and to a ``final_obs``, so these are sent as they
+    are at that moment.
     """
     if type(info) is not dict:
         info = dict(info.items())
@@ -36,7 +37,7 @@ def taken(info: dict[Any, Any], depth: int = _DEPTH) -> dict[Any, Any]:
 
 
 def kept(value: Any, depth: int = _DEPTH, seen: dict[int, Any] | None = None) -> Any:
-    """A value as it is now, with all containers and arrays in it."""
+    """Copies a value with all containers and arrays in it."""
     seen = {} if seen is None else seen
     if id(value) in seen or not depth:
         return seen.get(id(value), value)

@@ -1,4 +1,4 @@
-"""The random generators of an environment, whose states the client has and brings back."""
+"""An environment's random generators, whose states the client reads and sets."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 
 
 class Generators:
-    """Those of one environment: of its sub-environments, or its own one."""
+    """The generators of one environment: those of its sub-environments, or its only one."""
 
     def __init__(self) -> None:
         self._last: dict[int, tuple[int, Any]] = {}
 
     def states(self, env: Any) -> Any:
-        """The state of each with its number, or of the one there is."""
+        """Returns each generator's state with its number, or the state of the only one."""
         generators = env.np_random
         if not isinstance(generators, tuple):
             return self._state(0, generators)
@@ -33,7 +33,7 @@ class Generators:
 
 
 def bring(env: Any, states: tuple[Any, ...]) -> None:
-    """Bring generators to these states, in place; None leaves one as it is."""
+    """Set generators to these states in place; None leaves a generator unchanged."""
     generators = env.np_random
     each = generators if isinstance(generators, tuple) else (generators,)
     for generator, state in zip(each, states, strict=True):
@@ -42,7 +42,7 @@ def bring(env: Any, states: tuple[Any, ...]) -> None:
 
 
 def replace(env: Any, states: tuple[Any, ...]) -> None:
-    """Give sub-environments generators of their own, or the one of the vector environment."""
+    """Replace the sub-environments' generators, or the vector environment's only one."""
     owners = env.envs if isinstance(env.np_random, tuple) else (env,)
     for owner, state in zip(owners, states, strict=True):
         if state is not None:

@@ -1,13 +1,13 @@
-"""What a process has once, and all sub-environments in it share: whether any of it has moved.
+"""Watches state that a process has once and all its sub-environments share.
 
 ``AsyncVectorEnv`` gives each sub-environment a process, and with it global generators, module and
 class attributes, environment variables and a working directory of its own. Sub-environments that
-share a process share these, so whichever of them changes while they are reset and stepped may
-change the results of all.
+share a process share all of this: a change during ``reset`` or ``step`` may change the results of
+all.
 
 The positions of the generators of ``numpy.random`` and ``random`` are compared after each reset
-and step, two words each: whoever draws moves the index, whoever seeds replaces the state. What
-takes longer to read is compared from time to time: a change stays, so it is seen later. Followed:
+and step, two words each: a draw moves the index, a seed replaces the state. State that takes longer
+to read is compared from time to time: a change stays, so it is seen later. Followed:
 ``numpy/random/src/mt19937/mt19937.h``, CPython's ``Modules/_randommodule.c``.
 """
 
@@ -38,17 +38,17 @@ _MOST = 1024
 
 
 class SharedState:
-    """Compares what a process has once with what it was when this was made.
+    """Compares the process's shared state with its state when this object was made.
 
     Attributes of modules and classes, environment variables and the working directory count from
-    the first close look on: much is set once, where something is first built, reset or stepped.
+    the first close look on: many are set once, when the first sub-environment is built or stepped.
 
     Args:
-        root: The repository's folder. Its modules are looked at, and ``packages``.
+        root: The repository's folder. Its modules and ``packages`` are compared.
         report: Called once, with a name of ``SHARED_STATE``.
 
     Attributes:
-        packages: Those that define the environments.
+        packages: The packages that define the environments.
     """
 
     def __init__(self, root: str, report: Callable[[str], None]) -> None:
@@ -63,12 +63,12 @@ class SharedState:
         self._left = self._every = _FIRST
 
     def built(self, envs: list[Any]) -> None:
-        """All sub-environments exist; the packages that define them are looked at as well."""
+        """Compare the packages that define the environments, too, once all of them are built."""
         names = {type(getattr(env, "unwrapped", env)).__module__ for env in envs}
         self.packages = {name.partition(".")[0] for name in names} - _NOBODYS
 
     def look(self) -> None:
-        """After a reset or a step: report what has moved."""
+        """Report state that a reset or a step has changed. Called after each."""
         if self._report is None:
             return
         self._left -= 1
@@ -80,7 +80,7 @@ class SharedState:
             self.look_closely()
 
     def look_closely(self) -> None:
-        """As ``look``, also at what takes longer to read."""
+        """Like ``look``, and compare the state that takes longer to read."""
         self._left = self._every = min(2 * self._every, _MOST_APART)
         if self._report is None:
             return
@@ -100,7 +100,7 @@ class SharedState:
             report(name)
 
     def _read(self) -> dict[tuple[str, ...], object]:
-        """By the name in ``SHARED_STATE``, and whose it is."""
+        """Reads the state by its name in ``SHARED_STATE`` and its owner."""
         return {
             ("environment",): dict(os.environ),
             ("directory",): _working_directory(),
@@ -108,7 +108,7 @@ class SharedState:
         }
 
     def _scopes(self) -> Iterator[tuple[tuple[str, ...], object]]:
-        """The attributes of each module that is looked at, and of each class in it."""
+        """Yields the attributes of each compared module, and of each class in it."""
         for name, module in list(sys.modules.items()):
             if self._is_looked_at(name, module):
                 own = dict(vars(module))
@@ -126,7 +126,7 @@ class SharedState:
 
 
 def _plain(attributes: dict[str, Any]) -> dict[str, object]:
-    """Values that cannot change from within, and the lengths of containers."""
+    """Returns a comparable form of attributes: immutable values, and the lengths of containers."""
     return {
         name: _READABLE[type(value)](value)
         for name, value in attributes.items()
@@ -145,14 +145,14 @@ def _numpy_generator() -> Any:
 
 
 def _numpy_words(generator: Any) -> memoryview:
-    """The first word of its state, and the position."""
+    """Returns a live view of two words of ``numpy.random``: the state's first, and the position."""
     if type(generator) is not np.random.MT19937:
         return _NO_WORDS
     return _words(generator.ctypes.state_address)[::_WORDS]
 
 
 def _random_words() -> memoryview:
-    """The position, and the first word of the state."""
+    """Returns a live view of two words of ``random``: the position, and the state's first."""
     words = _words(id(random._inst) + object.__basicsize__)
     version, state, _ = random.getstate()
     same_words = version == 3 and words.tolist() == [state[-1], *state[:-1]]
@@ -169,7 +169,7 @@ _NO_WORDS = memoryview(bytes(8)).cast("I")
 
 
 def _torch_states() -> list[Any]:
-    """The states of torch's generators; none where it has not been imported."""
+    """Reads the states of torch's generators; none if torch is not imported."""
     torch = sys.modules.get("torch")
     if torch is None or not hasattr(torch, "default_generator"):
         return []
@@ -180,7 +180,7 @@ def _torch_states() -> list[Any]:
 
 
 def _are_equal(before: list[Any], now: list[Any]) -> bool:
-    """A library that was imported since has not been drawn from as far as is known."""
+    """Whether two readings are equal; a library imported since the first one counts as equal."""
     return all(earlier == other for earlier, other in zip(before, now))  # noqa: B905
 
 
