@@ -13,12 +13,7 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.errors import (
-    RepositoryUnavailableError,
-    SnapshotError,
-    SnapshotIntegrityError,
-    SnapshotTooLargeError,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.hub import local as module
 from envhub_sandbox.hub.local import LeftOut, split_local
 from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, is_here, local, snapshot_named
@@ -111,7 +106,7 @@ def test_a_folder_that_is_here_comes_before_the_hub(
         ]
     else:
         assert told == []
-    with pytest.raises(RepositoryUnavailableError, match=r"Did you mean '.*/org/env\.py'\?"):
+    with pytest.raises(errors.RepositoryUnavailableError, match=r"Did you mean '.*/org/env\.py'\?"):
         snapshot_named("org/evn.py")
     others = ("org/repo@main", "pypi:x#y", "github:a/b:env.py", "https://x/org/env.py", "no/repo")
     assert not any(map(is_here, others))
@@ -119,9 +114,11 @@ def test_a_folder_that_is_here_comes_before_the_hub(
 
 @pytest.mark.parametrize("path", ["envs.py", "../my-env/env.py", "/etc/passwd", "sub"])
 def test_missing_entry_lists_the_python_files(folder: Path, path: str) -> None:
-    with pytest.raises(RepositoryUnavailableError, match=r"it has 'env\.py', 'sub/other\.py'"):
+    with pytest.raises(
+        errors.RepositoryUnavailableError, match=r"it has 'env\.py', 'sub/other\.py'"
+    ):
         local(f"{folder}:{path}")
-    with pytest.raises(RepositoryUnavailableError, match=r"no such folder.*'\./folder'"):
+    with pytest.raises(errors.RepositoryUnavailableError, match=r"no such folder.*'\./folder'"):
         local(folder.parent / "my-enf")
 
 
@@ -153,7 +150,9 @@ def test_a_virtualenv_is_left_out_and_said(folder: Path, caplog: pytest.LogCaptu
         assert names(local(folder)) == ["env.py", "sub/other.py"]
     said = f"local folder {folder}: the code sees 2 files of it; left out: "
     assert caplog.messages == [f"{said}.venv/ (a virtual environment)"]
-    with pytest.raises(RepositoryUnavailableError, match=r"'.venv/bin/x.py', but left it out"):
+    with pytest.raises(
+        errors.RepositoryUnavailableError, match=r"'.venv/bin/x.py', but left it out"
+    ):
         local(f"{folder}:.venv/bin/x.py")
 
 
@@ -223,7 +222,7 @@ def test_link_that_leaves_the_folder_is_refused(folder: Path, target: str) -> No
     (folder / ".git").mkdir()
     (folder / ".git/config").write_text("s")
     (folder / "link").symlink_to(target)
-    with pytest.raises(SnapshotError, match="'link' points outside the folder"):
+    with pytest.raises(errors.SnapshotError, match="'link' points outside the folder"):
         local(folder)
 
 
@@ -238,13 +237,13 @@ def test_a_link_to_nothing_is_left_out_and_said(folder: Path, target: str) -> No
 @pytest.mark.parametrize(("target", "said"), [(".", "loop"), ("../sub", "loop"), ("..", "loop")])
 def test_link_without_an_end_is_named(folder: Path, target: str, said: str) -> None:
     (folder / "sub" / "link").symlink_to(target)
-    with pytest.raises(SnapshotError, match=said):
+    with pytest.raises(errors.SnapshotError, match=said):
         local(folder)
 
 
 def test_bottomless_folder_is_refused(folder: Path) -> None:
     folder.joinpath(*["d"] * 80).mkdir(parents=True)
-    with pytest.raises(SnapshotError, match="is over 64 folders deep"):
+    with pytest.raises(errors.SnapshotError, match="is over 64 folders deep"):
         local(folder)
 
 
@@ -253,7 +252,9 @@ def test_large_folder_is_refused(folder: Path, name: str, monkeypatch: pytest.Mo
     """A home folder that was given by mistake is not copied; the error says what counts."""
     (folder / "env.py").write_text("22")
     monkeypatch.setattr(module, "DEFAULT_LIMITS", SnapshotLimits(**{name: 1}))
-    with pytest.raises(SnapshotTooLargeError, match=rf"{name}(.|\n)*every file in it is included"):
+    with pytest.raises(
+        errors.SnapshotTooLargeError, match=rf"{name}(.|\n)*every file in it is included"
+    ):
         local(folder)
 
 
@@ -267,7 +268,7 @@ def test_edited_copy_is_refused_and_half_of_one_made_again(folder: Path) -> None
     assert entry.read_text() == "1"
     entry.chmod(0o644)
     entry.write_text("x")
-    with pytest.raises(SnapshotIntegrityError, match="was changed"):
+    with pytest.raises(errors.SnapshotIntegrityError, match="was changed"):
         local(folder)
 
 
@@ -293,5 +294,5 @@ def test_an_example_is_found_from_anywhere(
 
 @pytest.mark.parametrize("name", ["", "nope", "../tests", "cartpole/env.py", "ci"])
 def test_what_is_no_example_is_refused_with_those_that_there_are(name: str) -> None:
-    with pytest.raises(RepositoryUnavailableError, match="choose one: examples:cartpole, "):
+    with pytest.raises(errors.RepositoryUnavailableError, match="choose one: examples:cartpole, "):
         split_local(f"examples:{name}")

@@ -7,16 +7,7 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.errors import (
-    EnvHubError,
-    LoadError,
-    PolicyError,
-    SandboxUnavailableError,
-    ServerBusyError,
-    WorkerDiedError,
-    WorkerStartupError,
-    WorkerTimeoutError,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.extras.fleet.fleet import MOST_PLACES, Fleet, places_of
 from envhub_sandbox.factory.make_env import sandbox_of
 from envhub_sandbox.sandboxes.process import PROCESS
@@ -29,7 +20,7 @@ from envhub_worker.protocol.keys import key_text
 def test_a_fleet_is_no_place_of_another() -> None:
     for nested in (Fleet(["tcp://a:1"]), "tcp://a:1,tcp://b:1", ["tcp://a:1"]):
         places: Any = [nested]
-        with pytest.raises(PolicyError, match="no fleet"):
+        with pytest.raises(errors.PolicyError, match="no fleet"):
             Fleet(places).opened(sandbox_of)
 
 
@@ -45,7 +36,7 @@ def test_a_fleet_is_no_place_of_another() -> None:
 )
 def test_what_is_no_fleet_says_what_is_one(places: Any, remote: Any, said: str) -> None:
     """When it is made, and before anything is started."""
-    with pytest.raises(PolicyError, match=said):
+    with pytest.raises(errors.PolicyError, match=said):
         Fleet(places, remote)
 
 
@@ -72,14 +63,14 @@ def test_places_stand_in_a_list_or_a_text() -> None:
 
 @pytest.mark.parametrize("source", [[], "", ",", ["process"] * (MOST_PLACES + 1)])
 def test_no_places_and_too_many_are_refused(source: Any) -> None:
-    with pytest.raises(PolicyError, match=r"a fleet names (0|4097) places"):
+    with pytest.raises(errors.PolicyError, match=r"a fleet names (0|4097) places"):
         places_of(source)
 
 
 # --- When another place of a fleet is worth a try, and what is said where none takes a worker
 
 
-BUSY = ServerBusyError("a: no room")
+BUSY = errors.ServerBusyError("a: no room")
 
 
 @pytest.mark.parametrize(
@@ -87,25 +78,27 @@ BUSY = ServerBusyError("a: no room")
     [
         (BUSY, True),
         (UnreachableError("nothing answers"), True),
-        (WorkerStartupError("it did not start"), True),
-        (WorkerDiedError("lost", reason="connection"), True),
-        (WorkerDiedError("ended", reason="server"), True),
-        (WorkerTimeoutError("the worker did not answer in time"), True),
-        (LoadError("the repository failed"), False),
-        (WorkerDiedError("it was killed", reason="signal"), False),
-        (WorkerTimeoutError("make_env takes too long", request="make_env"), False),
-        (SandboxUnavailableError("the server does not know our key"), False),
-        (PolicyError("not permitted"), False),
+        (errors.WorkerStartupError("it did not start"), True),
+        (errors.WorkerDiedError("lost", reason="connection"), True),
+        (errors.WorkerDiedError("ended", reason="server"), True),
+        (errors.WorkerTimeoutError("the worker did not answer in time"), True),
+        (errors.LoadError("the repository failed"), False),
+        (errors.WorkerDiedError("it was killed", reason="signal"), False),
+        (errors.WorkerTimeoutError("make_env takes too long", request="make_env"), False),
+        (errors.SandboxUnavailableError("the server does not know our key"), False),
+        (errors.PolicyError("not permitted"), False),
     ],
 )
-def test_a_full_or_absent_place_is_followed_by_another(error: EnvHubError, elsewhere: bool) -> None:
+def test_a_full_or_absent_place_is_followed_by_another(
+    error: errors.EnvHubError, elsewhere: bool
+) -> None:
     """What would be the same elsewhere is not tried again, or is a mistake to be known."""
     assert may_go_elsewhere(error) is elsewhere
 
 
 def test_the_error_for_all_is_one_that_may_pass() -> None:
     """With what each place has said; a single place's error stays as it is."""
-    lost = WorkerDiedError("b: lost\nmore of it", reason="connection")
+    lost = errors.WorkerDiedError("b: lost\nmore of it", reason="connection")
     found = worst_of([lost, BUSY])
     assert found is BUSY
     assert str(found) == "a: no room\nThe other places of the fleet:\nb: lost"

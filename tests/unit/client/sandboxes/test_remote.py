@@ -11,14 +11,7 @@ from typing import Any
 import pytest
 import zmq
 
-from envhub_sandbox.errors import (
-    DependencyError,
-    PolicyError,
-    RemoteProtocolError,
-    SandboxUnavailableError,
-    SnapshotError,
-    WorkerTimeoutError,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.extras.packages.declared import parse_requirement
 from envhub_sandbox.extras.packages.modules import Guess
 from envhub_sandbox.extras.packages.packages import PackageSet
@@ -44,7 +37,7 @@ from tests.support import inside
 
 FAULTS = (
     zmq.ZMQError(errno.EMFILE),
-    WorkerTimeoutError("late"),
+    errors.WorkerTimeoutError("late"),
     RuntimeError("set changed size during iteration"),
 )
 
@@ -108,9 +101,9 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 def test_only_host_and_port_are_an_address(wrong: str) -> None:
     assert remote_keys.address_of("tcp://[::1]:80") == "::1:80"
-    with pytest.raises(PolicyError, match="tcp://HOST:PORT"):
+    with pytest.raises(errors.PolicyError, match="tcp://HOST:PORT"):
         remote_keys.address_of(wrong)
-    with pytest.raises(PolicyError, match="leave out the login") as login:
+    with pytest.raises(errors.PolicyError, match="leave out the login") as login:
         remote_keys.address_of("tcp://me:secret@host:1")
     assert "secret" not in str(login.value)
 
@@ -124,20 +117,20 @@ def test_a_servers_key_is_given_or_known(config: Path, monkeypatch: pytest.Monke
     """The argument comes before the environment, and that before the file."""
     pairs = [keys.generate() for _ in range(3)]
     texts = [key_text(pair.public) for pair in pairs]
-    with pytest.raises(SandboxUnavailableError, match="another program could imitate"):
+    with pytest.raises(errors.SandboxUnavailableError, match="another program could imitate"):
         remote_keys.server_key(_ENDPOINT, None)
     (config / "known_hosts").write_text(f"other:1 {texts[1]}\nhost:7777 {texts[0]}\n")
     assert remote_keys.server_key(_ENDPOINT, None) == pairs[0].public
     monkeypatch.setenv(remote_keys.SERVER_KEY_VARIABLE, texts[1])
     assert remote_keys.server_key(_ENDPOINT, None) == pairs[1].public
     assert remote_keys.server_key(_ENDPOINT, texts[2]) == pairs[2].public
-    with pytest.raises(PolicyError, match="server_key"):
+    with pytest.raises(errors.PolicyError, match="server_key"):
         remote_keys.server_key(_ENDPOINT, "mistyped")
 
 
 def test_our_key_is_a_text_or_a_file(config: Path) -> None:
     """By default the one that lies where ``keygen`` is advised to write it."""
-    with pytest.raises(SandboxUnavailableError, match="keygen"):
+    with pytest.raises(errors.SandboxUnavailableError, match="keygen"):
         remote_keys.client_key(None)
     pair = keys.generate()
     path, _ = keys.save(pair, config, "client")
@@ -160,21 +153,21 @@ def test_a_file_of_keys_that_cannot_be_read_is_said(config: Path, name: str) -> 
     (config / name).write_bytes(f"\ufeff{line}\n".encode())
     assert read() in (pair.public, pair.secret)
     (config / name).write_bytes(b"\xff\xfe\x00")
-    with pytest.raises((PolicyError, SandboxUnavailableError)):
+    with pytest.raises((errors.PolicyError, errors.SandboxUnavailableError)):
         read()
     with (config / name).open("wb") as file:
         file.truncate(1 << 30)
-    with pytest.raises(PolicyError, match="larger than 1 MiB"):
+    with pytest.raises(errors.PolicyError, match="larger than 1 MiB"):
         read()
     (config / name).unlink()
     (config / name).mkdir()
-    with pytest.raises(PolicyError, match="Is a directory"):
+    with pytest.raises(errors.PolicyError, match="Is a directory"):
         read()
 
 
 def test_a_key_that_was_mistyped_is_not_repeated(config: Path, tmp_path: Path) -> None:
     for wrong in ("nowhere/" + "k" * 33, str(tmp_path / "none.key"), "x" * 41, "a/\0b"):
-        with pytest.raises(PolicyError, match="client_key") as caught:
+        with pytest.raises(errors.PolicyError, match="client_key") as caught:
             remote_keys.client_key(wrong)
         assert wrong not in str(caught.value)
 
@@ -188,7 +181,7 @@ def test_a_listing_names_each_file_once(tmp_path: Path) -> None:
     assert [(one.path, one.size) for one in found] == [("a", 0), ("sub/b", len(large))]
     assert [one.sha256 for one in found] == [hashlib.sha256(x).digest() for x in (b"", large)]
     (tmp_path / "gone").symlink_to("nowhere")
-    with pytest.raises(SnapshotError, match="cannot be read"):
+    with pytest.raises(errors.SnapshotError, match="cannot be read"):
         remote_repository.listing(tmp_path)
 
 
@@ -250,7 +243,7 @@ def test_its_own_packages_are_no_set(server: LyingServer) -> None:
     made, target = make(server, [])
     assert (made, target.orders) == (None, {})
     says(server, m.Refusal("DependencyError", "no such version", "", ""))
-    with pytest.raises(DependencyError, match="no such version"):
+    with pytest.raises(errors.DependencyError, match="no such version"):
         make(server, [])
 
 
@@ -270,7 +263,7 @@ def test_its_own_packages_are_no_set(server: LyingServer) -> None:
 )
 def test_other_answers_break_the_protocol(server: LyingServer, lie: m.Message) -> None:
     says(server, lie)
-    with pytest.raises(RemoteProtocolError):
+    with pytest.raises(errors.RemoteProtocolError):
         make(server, [])
 
 
@@ -278,7 +271,7 @@ def test_a_server_that_never_ends_is_given_up(server: LyingServer) -> None:
     says(server, packages("making"))
     client = WorkerConnection(server.endpoint, server.process_fd)
     try:
-        with pytest.raises(WorkerTimeoutError):
+        with pytest.raises(errors.WorkerTimeoutError):
             request_packages(order_of(REQUEST), client, Deadline(0.05))
     finally:
         client.close()
@@ -302,7 +295,7 @@ def test_packages_of_a_new_server_shorten_no_start(server: LyingServer, tmp_path
 
 @pytest.mark.parametrize("given", [{"python": "/usr/bin/python3"}, {"fetch_python": True}])
 def test_what_is_of_this_machine_is_not_asked_for(given: dict[str, Any]) -> None:
-    with pytest.raises(PolicyError, match="dependencies"):
+    with pytest.raises(errors.PolicyError, match="dependencies"):
         order_of(PackageRequest("org/repo", (), **given))
 
 

@@ -6,14 +6,7 @@ from unittest.mock import MagicMock, Mock
 
 import pytest
 
-from envhub_sandbox.errors import (
-    ActionError,
-    LocalProtocolError,
-    RemoteEnvError,
-    RemoteProtocolError,
-    WorkerDiedError,
-    remote_error,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.session.lease import AttributeCache
 from envhub_sandbox.session.use_lock import UseLock
 from envhub_worker.protocol.lifecycle import State
@@ -28,7 +21,7 @@ from tests.support.in_process.fake_lane import FakeLane, session_over
 def test_the_first_line_names_the_rows_and_the_place(rows: tuple[int, int], named: str) -> None:
     """What follows it, and further arguments, stay; a second naming adds nothing."""
     part = session_over(FakeLane(rows[1] - rows[0]), rows)
-    error = WorkerDiedError("it has ended\nits last words")
+    error = errors.WorkerDiedError("it has ended\nits last words")
     error.args = (*error.args, "more")
     for _ in range(2):
         part.name_in(error)
@@ -40,11 +33,11 @@ def test_the_first_line_names_the_rows_and_the_place(rows: tuple[int, int], name
 
 def test_errors_of_others_keep_their_text() -> None:
     part = session_over(FakeLane(1), (0, 1))
-    theirs = remote_error("ValueError", "ValueError", "size")
-    assert isinstance(theirs, RemoteEnvError)
-    bare = WorkerDiedError("")
+    theirs = errors.remote_error("ValueError", "ValueError", "size")
+    assert isinstance(theirs, errors.RemoteEnvError)
+    bare = errors.WorkerDiedError("")
     bare.args = ()
-    for error in (theirs, LocalProtocolError("a lambda cannot be sent"), bare):
+    for error in (theirs, errors.LocalProtocolError("a lambda cannot be sent"), bare):
         before = error.args
         part.name_in(error)
         assert error.args == before
@@ -111,8 +104,8 @@ def closed(lease: Any, fails: BaseException) -> BaseException:
 @pytest.mark.parametrize(
     ("fails", "told"),
     [
-        (OSError("the socket is gone"), WorkerDiedError),
-        (WorkerDiedError("closed"), WorkerDiedError),
+        (OSError("the socket is gone"), errors.WorkerDiedError),
+        (errors.WorkerDiedError("closed"), errors.WorkerDiedError),
         (KeyboardInterrupt(), KeyboardInterrupt),
     ],
 )
@@ -131,9 +124,9 @@ def test_a_close_in_its_midst_is_finished_and_told(
 @pytest.mark.parametrize(
     ("fails", "state", "told", "ends"),
     [
-        (TypeError("unhashable"), State.READY, RemoteProtocolError, True),
-        (RemoteProtocolError("a lie"), State.READY, RemoteProtocolError, True),
-        (ActionError("the caller's"), State.READY, ActionError, False),
+        (TypeError("unhashable"), State.READY, errors.RemoteProtocolError, True),
+        (errors.RemoteProtocolError("a lie"), State.READY, errors.RemoteProtocolError, True),
+        (errors.ActionError("the caller's"), State.READY, errors.ActionError, False),
         (TypeError("dealt with"), State.LATE, TypeError, False),
     ],
 )

@@ -5,13 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox.errors import (
-    LocalProtocolError,
-    RemoteEnvError,
-    RemoteProtocolError,
-    WorkerDiedError,
-    WorkerError,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.session.parts.fleet_session import FleetRequests, FleetSession
 from envhub_sandbox.session.parts.in_flight import InFlight
 from envhub_worker.protocol import messages as m
@@ -52,17 +46,17 @@ def test_a_worker_that_was_sent_nothing_falls_behind(
     """The others were: it is raised when they are waited for, and only a reset may follow."""
 
     def refuses(actions: Any, *, ahead: bool = False) -> None:
-        raise LocalProtocolError("too large to send")
+        raise errors.LocalProtocolError("too large to send")
 
     monkeypatch.setattr(lanes[1], "send_step", refuses)
     requests.submit_step(ACTIONS)
-    with pytest.raises(LocalProtocolError, match="too large"):
+    with pytest.raises(errors.LocalProtocolError, match="too large"):
         requests.collect_step(None)
     assert states(session) == [State.READY, State.LATE]
     assert lanes[0].owed is None
     monkeypatch.setattr(lanes[0], "send_step", refuses)
     session.parts[1].lifecycle.state = State.READY
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(errors.LocalProtocolError):
         requests.submit_step(ACTIONS)
     assert states(session) == [State.READY, State.READY], "nothing was sent to anybody"
 
@@ -77,8 +71,8 @@ def test_one_is_asked_of_its_worker_alone(requests: FleetRequests, lanes: list[F
     requests.ask_one("act", 1, message)
     assert asked == [0]
     assert [len(lane.sent) for lane in lanes] == [0, 1]
-    lanes[1].fails = WorkerDiedError("gone")
-    with pytest.raises(WorkerDiedError, match="sub-environment 1 of 2"):
+    lanes[1].fails = errors.WorkerDiedError("gone")
+    with pytest.raises(errors.WorkerDiedError, match="sub-environment 1 of 2"):
         requests.ask_one("act", 1, message)
 
 
@@ -104,9 +98,9 @@ def test_torn_connection_is_refused_until_a_reset(flight: InFlight, lanes: list[
     """What the next message would be taken for is not known; nothing more is sent or taken."""
     send(flight, 0, 1)
     lanes[1].jail.client.torn = True
-    with pytest.raises(WorkerError, match="interrupted"):
+    with pytest.raises(errors.WorkerError, match="interrupted"):
         flight.recv(1, 0)
-    with pytest.raises(WorkerError, match="interrupted"):
+    with pytest.raises(errors.WorkerError, match="interrupted"):
         send(flight, 0)
     flight.drop()
     assert lanes[0].owed is None
@@ -118,12 +112,12 @@ def test_infos_that_break_a_rule_end_their_worker_alone(
 ) -> None:
     lanes[0].infos = {"x": [1]}
     send(flight, 0, 1)
-    with pytest.raises(RemoteProtocolError):
+    with pytest.raises(errors.RemoteProtocolError):
         flight.recv(2, 0)
     assert [part.lifecycle.state for part in session.parts] == [State.DEAD, State.PENDING]
     assert received(flight, 2) == [1]
     lanes[1].infos = {None: None}
     send(flight, 1)
-    with pytest.raises(RemoteEnvError, match="do not go together"):  # as Gymnasium's
+    with pytest.raises(errors.RemoteEnvError, match="do not go together"):  # as Gymnasium's
         flight.recv(1, 0)
     assert session.parts[1].lifecycle.state is State.READY

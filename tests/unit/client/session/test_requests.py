@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
-from envhub_sandbox.errors import (
-    LocalProtocolError,
-    RemoteEnvError,
-    RemoteEnvWarning,
-    RemoteProtocolError,
-    WorkerDiedError,
-    WorkerTimeoutError,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.extras.crash.history import History
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_worker.protocol import messages as m
@@ -50,7 +43,7 @@ def test_a_request_is_sent_counted_and_kept(session: EnvSession, lane: FakeLane)
     assert session.counters.requests == 1
     assert recorded(session) == [m.Render(lane.number)]
     lane.answer = m.RaisedException("ValueError", "a.Oops", "no", "trace", "run")
-    with pytest.raises(RemoteEnvError, match="no"):
+    with pytest.raises(errors.RemoteEnvError, match="no"):
         session.requests.ask("render", render)
     assert session.lifecycle.state is State.READY
 
@@ -59,10 +52,10 @@ def test_what_is_sent_instead_is_not_what_is_kept(session: EnvSession, lane: Fak
     """The history repeats the caller's request; what cannot be sent was not sent."""
 
     def unsendable(request: object) -> None:
-        raise LocalProtocolError("too large")
+        raise errors.LocalProtocolError("too large")
 
     send, lane.send = lane.send, unsendable  # type: ignore[method-assign]
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(errors.LocalProtocolError):
         session.requests.submit("render", render)
     lane.send = send  # type: ignore[method-assign]
     assert session.counters.requests == 0
@@ -75,19 +68,19 @@ def test_a_wrong_message_gives_the_worker_up(session: EnvSession, lane: FakeLane
     for lane.answer in (m.Value(1), m.Method()):
         assert session.requests.ask_own("name", m.GetOwn, "name") == lane.answer
     lane.answer = m.ResetDone(0, {})
-    with pytest.raises(RemoteProtocolError, match="ResetDone where Value or Method belongs"):
+    with pytest.raises(errors.RemoteProtocolError, match="ResetDone where Value or Method belongs"):
         session.requests.ask_own("name", m.GetOwn, "name")
     assert session.lifecycle.state is State.DEAD
-    with pytest.raises(WorkerDiedError, match="cannot render"):
+    with pytest.raises(errors.WorkerDiedError, match="cannot render"):
         session.requests.ask("render", render)
 
 
 def test_a_late_reply_is_refused_until_a_reset(session: EnvSession, lane: FakeLane) -> None:
-    lane.fails = WorkerTimeoutError("late")
-    with pytest.raises(WorkerTimeoutError, match="render has not finished after"):
+    lane.fails = errors.WorkerTimeoutError("late")
+    with pytest.raises(errors.WorkerTimeoutError, match="render has not finished after"):
         session.requests.ask("render", render)
     assert (session.lifecycle.state, session.counters.timeouts) == (State.LATE, 1)
-    with pytest.raises(WorkerTimeoutError, match="the reply to the last request is late"):
+    with pytest.raises(errors.WorkerTimeoutError, match="the reply to the last request is late"):
         session.requests.submit_step(ACTIONS)
     session.recover()
     assert session.lifecycle.state is State.READY
@@ -131,7 +124,7 @@ def test_what_only_sends_is_not_stopped_by_a_filter(session: EnvSession, lane: F
         warnings.simplefilter("error")
         unshown.append(("Warning", "sent"))
         session.requests.submit("render", render)
-        with pytest.raises(RemoteEnvWarning, match="sent"):
+        with pytest.raises(errors.RemoteEnvWarning, match="sent"):
             session.requests.collect(1.0, m.Value)
         assert lane.owed is None
         session.requests.ask("render", render)

@@ -6,12 +6,7 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.errors import (
-    EnvHubError,
-    HubReferenceError,
-    RepositoryUnavailableError,
-    SnapshotError,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.extras.sources.assets import CardError, declared_assets, with_assets
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, fetch
@@ -128,7 +123,7 @@ def test_what_is_no_asset_is_refused_before_any_request(
     """By the caller's word and by a card's, which could have any server asked that we can reach."""
     snapshot = own(stub_hub, hub, *([f"'{text}'"] if where != "assets" else []))
     before = len(stub_hub.requests)
-    with pytest.raises(HubReferenceError, match=said) as caught:
+    with pytest.raises(errors.HubReferenceError, match=said) as caught:
         with_assets(snapshot, [text] if where == "assets" else [], hub)
     assert str(caught.value).startswith(f"{snapshot.label}: {where} holds ")
     assert "hf_secret" not in str(caught.value)
@@ -141,23 +136,23 @@ def test_one_repository_is_shown_at_one_commit(stub_hub: StubHub, hub: dict[str,
     assert with_assets(snapshot, [], hub) is snapshot
     [asset] = with_assets(snapshot, ["org/data"], hub).assets
     assert (asset.repo_type, asset.commit) == ("dataset", COMMIT)
-    with pytest.raises(HubReferenceError, match="at one commit"):
+    with pytest.raises(errors.HubReferenceError, match="at one commit"):
         with_assets(snapshot, ["org/data", f"datasets/org/data@{COMMIT}"], hub)
-    with pytest.raises(EnvHubError, match=r"It is an asset: assets names it\.$"):
+    with pytest.raises(errors.EnvHubError, match=r"It is an asset: assets names it\.$"):
         with_assets(snapshot, ["org/absent"], hub)
 
 
 @pytest.mark.parametrize(
     ("declared", "kind", "said"),
     [
-        ("org/data", HubReferenceError, "full commits only"),
-        ("datasets/org/data@main", HubReferenceError, "full commits only"),
-        ("{a: b}", SnapshotError, "is refused"),
-        (f"org/absent@{COMMIT}", RepositoryUnavailableError, "fetched without a login"),
+        ("org/data", errors.HubReferenceError, "full commits only"),
+        ("datasets/org/data@main", errors.HubReferenceError, "full commits only"),
+        ("{a: b}", errors.SnapshotError, "is refused"),
+        (f"org/absent@{COMMIT}", errors.RepositoryUnavailableError, "fetched without a login"),
     ],
 )
 def test_a_card_may_name_public_commits_only(
-    stub_hub: StubHub, hub: dict[str, Any], declared: str, kind: type[EnvHubError], said: str
+    stub_hub: StubHub, hub: dict[str, Any], declared: str, kind: type[errors.EnvHubError], said: str
 ) -> None:
     """What changes would be chosen by its author, and what is private is the caller's."""
     snapshot = own(stub_hub, hub, declared)

@@ -7,16 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from envhub_sandbox.errors import (
-    EnvHubError,
-    LoadError,
-    LocalProtocolError,
-    PolicyError,
-    RemoteProtocolError,
-    WorkerDiedError,
-    WorkerError,
-    remote_error,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.vector.tracebacks import short_traceback
 
 WHOLE = ["asked", "ask", "deep", "deeper"]
@@ -55,16 +46,16 @@ def frames(error: BaseException, asking: Callable[..., None] = ask) -> list[str]
 @pytest.mark.parametrize(
     "error",
     [
-        remote_error("ValueError", "ValueError", "no"),
-        LoadError("no"),
-        PolicyError("no"),
-        LocalProtocolError("no"),
-        WorkerDiedError("no", reason="exit"),
+        errors.remote_error("ValueError", "ValueError", "no"),
+        errors.LoadError("no"),
+        errors.PolicyError("no"),
+        errors.LocalProtocolError("no"),
+        errors.WorkerDiedError("no", reason="exit"),
     ],
     ids=lambda error: type(error).__name__,
 )
 @pytest.mark.parametrize("asking", [ask, ask_by_another])
-def test_one_frame_of_ours_is_left(error: EnvHubError, asking: Callable[..., None]) -> None:
+def test_one_frame_of_ours_is_left(error: errors.EnvHubError, asking: Callable[..., None]) -> None:
     assert frames(error, asking) == ["asked"]
     last = error.__traceback__.tb_next
     assert last.tb_frame.f_locals["__tracebackhide__"] is True
@@ -74,7 +65,7 @@ def test_one_frame_of_ours_is_left(error: EnvHubError, asking: Callable[..., Non
 
 @pytest.mark.parametrize(
     "error",
-    [RemoteProtocolError("no"), KeyError("of ours"), KeyboardInterrupt()],
+    [errors.RemoteProtocolError("no"), KeyError("of ours"), KeyboardInterrupt()],
     ids=lambda error: type(error).__name__,
 )
 def test_what_may_be_our_fault_keeps_its_frames(error: BaseException) -> None:
@@ -85,15 +76,15 @@ def test_what_may_be_our_fault_keeps_its_frames(error: BaseException) -> None:
 def test_logged_once(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
     """At DEBUG, however many methods of ours it comes through; a variable shows them all."""
     with caplog.at_level(logging.DEBUG, "envhub_sandbox.errors"):
-        frames(LoadError("no"), ask_by_another)
+        frames(errors.LoadError("no"), ask_by_another)
     [record] = [one for one in caplog.records if one.name == "envhub_sandbox.errors"]
     assert [frame.name for frame in traceback.extract_tb(record.exc_info[2])] == WHOLE
     monkeypatch.setenv("ENVHUB_TRACEBACK", "full")
-    assert frames(LoadError("no")) == WHOLE
+    assert frames(errors.LoadError("no")) == WHOLE
 
 
 def test_what_the_caller_was_handling_is_kept() -> None:
-    error, mine = LoadError("no"), KeyError("mine")
+    error, mine = errors.LoadError("no"), KeyError("mine")
     try:
         raise mine
     except KeyError:
@@ -105,15 +96,15 @@ def test_what_the_caller_was_handling_is_kept() -> None:
 
 
 def test_of_causes_only_ours_are_folded() -> None:
-    ours, theirs = LoadError("ours"), OSError("theirs")
-    for error, cause in ((ours, theirs), (PolicyError("on top"), ours)):
+    ours, theirs = errors.LoadError("ours"), OSError("theirs")
+    for error, cause in ((ours, theirs), (errors.PolicyError("on top"), ours)):
         with pytest.raises(type(error)):
             deeper(error, cause)
     assert ours.__traceback__ is not None
     with pytest.raises(OSError, match="theirs"):
         deeper(theirs, None)
-    with pytest.raises(PolicyError) as caught:
-        ask(PolicyError("on top"), ours)
+    with pytest.raises(errors.PolicyError) as caught:
+        ask(errors.PolicyError("on top"), ours)
     assert caught.value.__cause__ is ours
     assert ours.__traceback__ is None
     assert theirs.__traceback__ is not None
@@ -129,7 +120,7 @@ def test_of_causes_only_ours_are_folded() -> None:
 )
 def test_what_the_machine_lacks_is_an_error_of_ours(lack: int, cure: str) -> None:
     """With what to do; an error that says nothing of the kind stays what it is."""
-    with pytest.raises(WorkerError, match=rf" here: .*{cure}") as caught:
+    with pytest.raises(errors.WorkerError, match=rf" here: .*{cure}") as caught:
         ask(OSError(lack, "lacks"))
     assert isinstance(caught.value.__cause__, OSError)
     with pytest.raises(FileNotFoundError):

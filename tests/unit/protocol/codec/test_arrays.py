@@ -9,14 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from envhub_worker.protocol import errors
 from envhub_worker.protocol.codec import arrays
 from envhub_worker.protocol.codec.arrays import ArrayReader, ArrayWriter, read_numpy_scalar
 from envhub_worker.protocol.codec.encoder import encode
-from envhub_worker.protocol.errors import (
-    LocalProtocolError,
-    MessageTooLargeError,
-    RemoteProtocolError,
-)
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from tests.support.compare import assert_same
 from tests.support.decode import decode
@@ -127,13 +123,13 @@ def test_misaligned_frames_give_aligned_arrays() -> None:
     "dtype", [object, "V4", [("a", "f4")], np.longdouble, np.clongdouble, "U300000", "S2000000"]
 )
 def test_dtypes_off_the_list_are_refused_before_sending(dtype: Any) -> None:
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(errors.LocalProtocolError):
         ArrayWriter().add(np.zeros(1, dtype))
 
 
 def test_more_than_32_dimensions_are_refused_before_sending() -> None:
     """numpy 2 allows 64 dimensions, numpy 1 only 32; the wire allows what both can hold."""
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(errors.LocalProtocolError):
         arrays.pack_shape((1,) * 33)
 
 
@@ -179,12 +175,12 @@ FRAMED = descriptor(F4, 1, frame=True)
     ],
 )
 def test_a_lying_array_is_refused(spoiled: bytes, tail: bytes, frames: tuple[bytes, ...]) -> None:
-    with pytest.raises(RemoteProtocolError):
+    with pytest.raises(errors.RemoteProtocolError):
         read(spoiled, tail, frames)
 
 
 def test_array_larger_than_a_frame_may_be_is_refused() -> None:
-    with pytest.raises(MessageTooLargeError, match="frame_bytes"):
+    with pytest.raises(errors.MessageTooLargeError, match="frame_bytes"):
         read(descriptor(F4, 2**30, frame=True), b"", (b"",))
 
 
@@ -199,5 +195,5 @@ def test_scalar_comes_back_as_the_same_numpy_type(name: str) -> None:
     "data", [b"", b"\x0a", b"\x0a" + bytes(3), b"\x0a" + bytes(5), b"\x00\x02", b"\xff\x00\x00"]
 )
 def test_malformed_scalar_is_refused(data: bytes) -> None:
-    with pytest.raises(RemoteProtocolError):
+    with pytest.raises(errors.RemoteProtocolError):
         read_numpy_scalar(data)

@@ -9,15 +9,11 @@ import msgpack
 import numpy as np
 import pytest
 
+from envhub_worker.protocol import errors
 from envhub_worker.protocol.codec.decoder import Decoder
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.codec.wire import GENERATOR, Buffer, split_frames
-from envhub_worker.protocol.errors import (
-    LocalProtocolError,
-    MessageTooLargeError,
-    RemoteProtocolError,
-)
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from tests.support.compare import assert_same
 from tests.support.decode import decode
@@ -40,7 +36,7 @@ def test_times_without_a_unit_are_refused() -> None:
     """Their ``repr`` raises, wherever a program prints one; the one that is no time has one."""
     times = np.array([4, 5]).view("M8")
     for value in (times, times[0]):
-        with pytest.raises(RemoteProtocolError, match="no unit"):
+        with pytest.raises(errors.RemoteProtocolError, match="no unit"):
             decode(encode(value))
     for value in (np.array(["NaT"], "M8"), np.array([4]).view("m8")):
         assert_same(value, decode(encode(value)))
@@ -89,7 +85,7 @@ def test_times_without_a_unit_are_refused() -> None:
     ids=lambda frames: b"|".join(frames)[:24].hex() or "none",
 )
 def test_malformed_messages_are_refused(frames: list[Buffer]) -> None:
-    with pytest.raises(RemoteProtocolError):
+    with pytest.raises(errors.RemoteProtocolError):
         decode(frames)
 
 
@@ -110,9 +106,9 @@ def test_malformed_messages_are_refused(frames: list[Buffer]) -> None:
 def test_every_limit_holds(most: object, more: object, limit: str) -> None:
     """In both directions; what is just within it passes."""
     assert_same(most, decode(encode(most, limits=SMALL), limits=SMALL))
-    with pytest.raises(MessageTooLargeError, match=limit):
+    with pytest.raises(errors.MessageTooLargeError, match=limit):
         decode(encode(more), limits=SMALL)
-    with pytest.raises(LocalProtocolError, match=f"{limit}|nested deeper|an integer"):
+    with pytest.raises(errors.LocalProtocolError, match=f"{limit}|nested deeper|an integer"):
         encode(more, limits=SMALL)
 
 
@@ -120,9 +116,9 @@ def test_many_keys_that_are_no_text_are_refused() -> None:
     """Python randomises the hash of text only; other keys are limited in number."""
     limits = WireLimits(hashed_keys=100)
     assert len(decode(encode(dict.fromkeys(map(str, range(101)))), limits=limits)) == 101
-    with pytest.raises(MessageTooLargeError, match="hashed_keys"):
+    with pytest.raises(errors.MessageTooLargeError, match="hashed_keys"):
         decode(encode(dict.fromkeys(range(101), 0)), limits=limits)
-    with pytest.raises(MessageTooLargeError, match="hashed_keys"):
+    with pytest.raises(errors.MessageTooLargeError, match="hashed_keys"):
         decode(encode([set(range(70)), frozenset(range(70))]), limits=limits)
 
 
@@ -131,7 +127,7 @@ def test_colliding_keys_are_refused() -> None:
     prime = 2**61 - 1
     colliding = {prime * i: 0 for i in range(100)}
     assert len({hash(key) for key in colliding}) == 1
-    with pytest.raises(RemoteProtocolError, match="collide"):
+    with pytest.raises(errors.RemoteProtocolError, match="collide"):
         decode(encode(colliding))
 
 

@@ -14,13 +14,7 @@ from gymnasium.vector import AsyncVectorEnv
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_sandbox.errors import (
-    LoadError,
-    RemoteEnvError,
-    RemoteProtocolError,
-    load_error,
-    remote_error,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.transport import values
 from envhub_sandbox.transport.values import spec_of
 from envhub_sandbox.vector.send_recv import SendRecv
@@ -70,7 +64,7 @@ def test_manifests_load_without_the_names_that_are_not_served() -> None:
     "name", ["/etc", "..", "../x", "a/../../x", "a\\..\\x", "\\x", "a/..", "//a"]
 )
 def test_names_of_tasks_lead_into_no_other_folder(field: str, name: str) -> None:
-    with pytest.raises(RemoteProtocolError, match="as a path"):
+    with pytest.raises(errors.RemoteProtocolError, match="as a path"):
         read(with_env(field, name))
 
 
@@ -114,13 +108,13 @@ def test_metadata_on_which_gymnasium_acts_is_typed(key: str, lie: object) -> Non
     ids=["list", "array", "nested", "objects", "key", "type"],
 )
 def test_metadata_is_bounded(lie: object) -> None:
-    with pytest.raises(RemoteProtocolError):
+    with pytest.raises(errors.RemoteProtocolError):
         read_metadata_facts(lie)
 
 
 def test_autoreset_modes_that_are_arrays_are_refused() -> None:
     for lie in (np.array(["NextStep", "SameStep"]), np.zeros(3), np.array("NextStep"), []):
-        with pytest.raises(RemoteProtocolError):
+        with pytest.raises(errors.RemoteProtocolError):
             read(with_env("autoreset_mode", lie))
 
 
@@ -145,7 +139,7 @@ def test_specs_keep_their_facts_only() -> None:
     ids=repr,
 )
 def test_specs_of_wrong_types_are_refused(lie: object) -> None:
-    with pytest.raises(RemoteProtocolError):
+    with pytest.raises(errors.RemoteProtocolError):
         read_spec_facts(lie)
 
 
@@ -185,7 +179,7 @@ def test_states_with_another_field_are_refused_or_harmless(kind: str, data: st.D
     )
     try:
         made = values.generator(state)
-    except RemoteProtocolError:
+    except errors.RemoteProtocolError:
         return
     made.integers(0, 3, 10_000)
 
@@ -204,11 +198,11 @@ def test_stand_ins_are_plain_values(value: RemoteObject) -> None:
 @pytest.mark.parametrize("builtin", ["AttributeError", "OSError", "KeyError", "no such one"])
 def test_remote_errors_keep_their_text(builtin: str) -> None:
     """With where they came from, copied and pickled; the builtin's own fields stay empty."""
-    error = remote_error(builtin, "a.Oops", "message", "trace")
+    error = errors.remote_error(builtin, "a.Oops", "message", "trace")
     error.args = ("org/repo: a.Oops: message",)
     for made in (pickle.loads(pickle.dumps(error)), copy.deepcopy(error), copy.copy(error)):
         assert type(made) is type(error)
-        assert isinstance(made, RemoteEnvError)
+        assert isinstance(made, errors.RemoteEnvError)
         assert (str(made), made.message, made.traceback) == (str(error), "message", "trace")
         for name in ("errno", "filename", "strerror", "name", "obj", "path"):
             assert getattr(made, name, None) is None
@@ -219,9 +213,9 @@ def test_remote_errors_are_their_builtin_but_for_what_a_caller_would_miss() -> N
     kinds = [kind for kind in vars(builtins).values() if isinstance(kind, type)]
     missed = (StopIteration, StopAsyncIteration, SyntaxError)
     for kind in (kind for kind in kinds if issubclass(kind, Exception)):
-        error = remote_error(kind.__name__, kind.__name__, "message")
+        error = errors.remote_error(kind.__name__, kind.__name__, "message")
         assert isinstance(error, kind) is not issubclass(kind, missed)
-        assert isinstance(load_error(kind.__name__, "message"), LoadError)
+        assert isinstance(errors.load_error(kind.__name__, "message"), errors.LoadError)
         assert "message" in "".join(traceback.format_exception(error))
 
 

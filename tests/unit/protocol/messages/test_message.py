@@ -12,16 +12,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 
+from envhub_worker.protocol import errors
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.arrays import ArrayReader
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
-from envhub_worker.protocol.errors import (
-    LocalProtocolError,
-    MessageTooLargeError,
-    ProtocolError,
-    RemoteProtocolError,
-)
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.messages import message
 from tests.support import inside, wire
@@ -116,20 +111,20 @@ def _known(value: object) -> bytes:
 @pytest.mark.parametrize("change", [lambda raw: raw[:-1], lambda raw: raw + b"x"])
 def test_the_bytes_of_a_known_message_are_counted(change: Any) -> None:
     header = _known("known")
-    with pytest.raises(RemoteProtocolError):
+    with pytest.raises(errors.RemoteProtocolError):
         m.unpack([change(header)])
-    with pytest.raises(RemoteProtocolError):
+    with pytest.raises(errors.RemoteProtocolError):
         m.unpack([header, b"more"])
 
 
 def test_the_limits_of_a_known_message_hold() -> None:
     value = ["a" * 20, 1]
     header = _known(value)
-    with pytest.raises(MessageTooLargeError):
+    with pytest.raises(errors.MessageTooLargeError):
         m.unpack([header], limits=WireLimits(header_bytes=20))
-    with pytest.raises(MessageTooLargeError):
+    with pytest.raises(errors.MessageTooLargeError):
         m.unpack([header], limits=WireLimits(depth=0))
-    with pytest.raises(LocalProtocolError):
+    with pytest.raises(errors.LocalProtocolError):
         m.pack(m.Value(value), limits=WireLimits(header_bytes=20))
 
 
@@ -139,9 +134,9 @@ def test_a_known_header_is_read_with_any_id() -> None:
         [header] = m.pack_header(message, number)
         assert m.unpack_header(bytes(header)) == (number, message)
         assert m.unpack_header(memoryview(header)) == (number, message)
-    with pytest.raises(RemoteProtocolError):
+    with pytest.raises(errors.RemoteProtocolError):
         m.unpack_header(bytes(header) + b"x")
-    with pytest.raises(MessageTooLargeError):
+    with pytest.raises(errors.MessageTooLargeError):
         m.unpack_header(bytes(header), limits=WireLimits(header_bytes=20))
 
 
@@ -151,7 +146,7 @@ def test_pickled_objects_and_tensors_never_have_a_form() -> None:
         message = m.unpack(frames, unpickler=cloudpickle.loads)
         assert type(message.value).__name__ == "_Own"  # type: ignore[attr-defined]
     for _ in range(3):
-        with pytest.raises(ProtocolError):
+        with pytest.raises(errors.ProtocolError):
             m.unpack(frames)
     torch = pytest.importorskip("torch")
     frames = m.pack(m.Value(torch.zeros(2)))
@@ -200,7 +195,7 @@ def test_a_form_keeps_no_array() -> None:
 def test_memory_that_is_not_there_is_the_peers_fault(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = m.pack(m.Value(np.zeros(50_000, np.uint8)))
     monkeypatch.setattr(ArrayReader, "take", Mock(side_effect=MemoryError))
-    with pytest.raises(MessageTooLargeError):
+    with pytest.raises(errors.MessageTooLargeError):
         m.unpack(frames)
 
 
@@ -210,7 +205,7 @@ def test_what_has_no_end_is_refused_as_without_a_form() -> None:
     deep: object = 1
     for _ in range(5000):
         deep = (deep,)
-    with pytest.raises(LocalProtocolError, match="contains itself"):
+    with pytest.raises(errors.LocalProtocolError, match="contains itself"):
         m.pack(m.Value({"a": cyclic}))
-    with pytest.raises(LocalProtocolError, match="nested deeper"):
+    with pytest.raises(errors.LocalProtocolError, match="nested deeper"):
         m.pack(m.Value({"a": deep}))

@@ -13,12 +13,7 @@ from typing import Any, cast
 
 import pytest
 
-from envhub_sandbox.errors import (
-    EnvHubError,
-    PolicyError,
-    SandboxUnavailableError,
-    WorkerStartupError,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.extras.docker import attestation, engines, published, run_arguments
 from envhub_sandbox.extras.docker.container import RepositoryContainer
 from envhub_sandbox.extras.docker.engines import Engine
@@ -152,14 +147,14 @@ def test_a_container_serves_until_it_is_given_back(
 @pytest.mark.parametrize(
     ("what", "mounts", "kind", "text"),
     [
-        ("fails", False, SandboxUnavailableError, "no such runtime"),
-        ("is open", False, SandboxUnavailableError, "container-files does not hold"),
-        ("has no key", False, WorkerStartupError, "build the image again"),
-        ("publishes elsewhere", False, SandboxUnavailableError, "does not publish"),
-        ("publishes nothing", False, SandboxUnavailableError, "does not publish"),
-        ("fails", True, EnvHubError, "no such runtime"),
-        ("is open", True, EnvHubError, "container-files"),
-        ("shares nothing", True, EnvHubError, "whose socket this process cannot use"),
+        ("fails", False, errors.SandboxUnavailableError, "no such runtime"),
+        ("is open", False, errors.SandboxUnavailableError, "container-files does not hold"),
+        ("has no key", False, errors.WorkerStartupError, "build the image again"),
+        ("publishes elsewhere", False, errors.SandboxUnavailableError, "does not publish"),
+        ("publishes nothing", False, errors.SandboxUnavailableError, "does not publish"),
+        ("fails", True, errors.EnvHubError, "no such runtime"),
+        ("is open", True, errors.EnvHubError, "container-files"),
+        ("shares nothing", True, errors.EnvHubError, "whose socket this process cannot use"),
     ],
 )
 def test_what_does_not_start_leaves_nothing(
@@ -209,7 +204,7 @@ def test_nothing_of_this_machine_is_mounted(tmp_path: Path) -> None:
     assert isinstance(DockerSandbox(published=True).package_target(), BuiltImageTarget)
     assert type(DockerSandbox().package_target()) is ImageTarget
     policy = Policy(readable=("/data",))
-    with pytest.raises(PolicyError, match="put what is needed into the repository"):
+    with pytest.raises(errors.PolicyError, match="put what is needed into the repository"):
         DockerSandbox(published=True).for_repository(tmp_path, policy, Runtime(""))
 
 

@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from envhub_sandbox.errors import (
-    RemoteEnvError,
-    RemoteProtocolError,
-    WorkerError,
-    WorkerTimeoutError,
-)
+from envhub_sandbox import errors
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.lane import Lane
@@ -147,7 +142,7 @@ def test_columns_follow_their_schema() -> None:
     assert (found["a"].tolist(), found["_a"].tolist()) == ([7, 8, 9], [True, True, False])
     fresh = ServedShard(both.layout, both.observed)
     assert (both.shard.known > 0, fresh.known) == (True, 0)
-    with pytest.raises(RemoteProtocolError, match="before their schema"):
+    with pytest.raises(errors.RemoteProtocolError, match="before their schema"):
         fresh.columns()
 
 
@@ -256,7 +251,7 @@ def test_what_came_as_a_message_is_checked() -> None:
         served.server.answer(told(), at=-2)
         served.server.answer(told(**lie))
         assert served.reward() == 0
-        with pytest.raises(RemoteProtocolError):
+        with pytest.raises(errors.RemoteProtocolError):
             served.reward()
 
 
@@ -269,7 +264,7 @@ def test_infos_that_are_fetched_are_infos(ahead: bool) -> None:
         served.server.answer(slab(slabs.FETCH))
         assert not ahead or not served.lane.answered()
         sent = _answering(served.server, lie)
-        with pytest.raises(RemoteProtocolError):
+        with pytest.raises(errors.RemoteProtocolError):
             served.reward()
         assert len(sent) == 2
     served = Served()
@@ -321,7 +316,7 @@ def test_infos_that_never_come_are_waited_for_no_longer_than_a_step() -> None:
     served.server.answer(slab(slabs.FETCH))
     assert not served.lane.answered()
     for wait in (served.lane.wait, served.lane.catch_up):
-        with pytest.raises(WorkerTimeoutError):
+        with pytest.raises(errors.WorkerTimeoutError):
             wait(Deadline(0))
     served.server.answer(INFOS)
     served.lane.catch_up(Deadline(0))
@@ -341,7 +336,7 @@ def test_infos_that_were_asked_for_in_vain_are_dropped(kind: int) -> None:
     served.server.answer(*[INFOS] * len(asked))
     assert served.lane.answered()
     served.lane.wait(Deadline(0))
-    with pytest.raises(RemoteEnvError, match="no"):
+    with pytest.raises(errors.RemoteEnvError, match="no"):
         served.lane.result()
     assert served.server.untaken == 0
     served.step()
@@ -377,13 +372,13 @@ def test_what_cannot_be_sent_or_was_interrupted_is_met_by_the_wait() -> None:
     served = Served()
     served.step()
     served.server.answer(slab(slabs.FETCH))
-    served.server.refuses = WorkerError("the worker took no request")
+    served.server.refuses = errors.WorkerError("the worker took no request")
     assert served.lane.answered()
-    with pytest.raises(WorkerError, match="took no request"):
+    with pytest.raises(errors.WorkerError, match="took no request"):
         served.lane.wait(Deadline(0))
     served = Served()
     served.step()
     served.server.answer(slab())
     served.server.torn = True
-    with pytest.raises(WorkerError, match="interrupted while it was sent"):
+    with pytest.raises(errors.WorkerError, match="interrupted while it was sent"):
         served.lane.catch_up(Deadline(0))
