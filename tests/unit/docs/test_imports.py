@@ -136,7 +136,6 @@ IMPORTERS = {
 
 def folder(package: str) -> Path:
     spec = importlib.util.find_spec(package)
-    assert spec.origin is not None
     return Path(spec.origin).parent
 
 

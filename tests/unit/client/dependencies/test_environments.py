@@ -43,10 +43,7 @@ def repository(folder: Path, *lines: str) -> Path:
 def made(folder: Path, **options: Any) -> Environment:
     tell = options.pop("tell", lambda line: None)
     request = request_of(local(folder), OWN)
-    assert request is not None
-    found = ThisMachine(**options).make(request, tell).environment
-    assert found is not None
-    return found
+    return ThisMachine(**options).make(request, tell).environment
 
 
 def left_behind() -> list[str]:

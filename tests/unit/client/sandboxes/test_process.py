@@ -87,7 +87,6 @@ def test_stop_leaves_nothing(server: LocalServer) -> None:
 def test_one_that_does_not_end_is_killed(server: LocalServer) -> None:
     started = [sys.executable, "-c", DEAF]
     child = subprocess.Popen(started, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    assert child.stdin is not None
     with child.stdin, child.stdout, server.starting(lambda _: child):
         assert child.stdout.read() == b"", "it ignores SIGTERM from now on"
         server.stop()

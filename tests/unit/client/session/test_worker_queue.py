@@ -73,9 +73,7 @@ def test_a_reset_waits_for_nothing_and_nobody(queue: WorkerQueue, part: EnvSessi
     taken(queue)
     queue.prepare_reset()
     queue.reset(reset)
-    reset_s = part.repository.timeouts.reset_s
-    assert reset_s is not None
-    assert 0 < (queue.left_s or 0) <= reset_s
+    assert 0 < (queue.left_s or 0) <= part.repository.timeouts.reset_s
     observation, rewards, terminations, truncations, infos = taken(queue)
     assert (observation.shape, rewards.tolist(), infos) == ((1, 3), [0.0], {})
     assert not terminations.any()

@@ -58,7 +58,6 @@ class _Runner:
 
     def __init__(self) -> None:
         layout = slabs.layout_of(spaces.Discrete(5), 1)
-        assert layout is not None
         self.lane = LaneShard(layout, 0)
         self._changes = 0
         self._wishes: tuple[int, int] = (0, 0)

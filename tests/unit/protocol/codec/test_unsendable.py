@@ -31,7 +31,6 @@ def frames_of(value: object) -> list[Any]:
 
 def through(value: object) -> Any:
     call = m.unpack(frames_of(value), unpickler=cloudpickle.loads)
-    assert isinstance(call, m.Call)
     return call.args[0]
 
 

@@ -49,8 +49,6 @@ def assert_apart(areas: list[tuple[int, int]], total: int) -> None:
 def test_nothing_in_a_slab_overlaps(space: gym.Space[Any], count: int) -> None:
     layout = slabs.layout_of(space, count)
     observed = slabs.observation_layout(space, count, 3)
-    assert layout is not None
-    assert observed is not None
     infos = (slabs.INFOS, slabs.INFOS + slabs.INFO_BYTES)
     assert_apart([(0, slabs.HEADER_BYTES), infos], slabs.REPLY_BYTES)
     results = (observed.results, observed.results + 10 * count)
@@ -65,7 +63,6 @@ def test_nothing_in_a_slab_overlaps(space: gym.Space[Any], count: int) -> None:
 @pytest.mark.parametrize("space", FIXED, ids=str)
 def test_a_batch_survives_its_leaves(space: gym.Space[Any]) -> None:
     layout = slabs.observation_layout(space, 3, 2)
-    assert layout is not None
     batched = batch_space(space, 3)
     batched.seed(7)
     batch = batched.sample()
@@ -99,8 +96,6 @@ def test_too_many_leaves_have_no_slab() -> None:
 
 def test_a_step_is_its_arrays() -> None:
     layout, observed = slabs.layout_of(BOX, 4), slabs.observation_layout(NESTED, 4, 3)
-    assert layout is not None
-    assert observed is not None
     assert layout.action_bytes == 4 * 3 * 4
     assert observed.batch_bytes == 4 * (60 + 8 + 7 + 8 + 8 + 1 + 1)
 

@@ -505,6 +505,5 @@ def test_the_same_seed_is_the_same_states() -> None:
 def test_a_shared_generator_is_told_once() -> None:
     one = spaces.Discrete(2, seed=3)
     states = seeded_states(spaces.Tuple([one, copy.copy(one)]))
-    assert states is not None
     assert states[2] == 1
     assert not isinstance(states[1], int)

@@ -17,8 +17,6 @@ def test_what_processes_use_is_added_up_by_client(monkeypatch: pytest.MonkeyPatc
         taken = figures.Usage(pytest.fail)
         assert eventually(lambda: len(procfs.descendants(process.pid)) == 1)
         found, again = (figures.look_at(process.pid) for _ in range(2))
-        assert found is not None
-        assert again is not None
         assert again.started == found.started, "it would be taken for another, and counted anew"
         assert (found.pid, found.memory_bytes > 0, found.cpu_s >= 0) == (process.pid, True, True)
         taken.watch({process.pid: "client"})

@@ -78,8 +78,6 @@ class Slab:
         if outcome == slabs.COLUMNS:
             return {c.key: c.view(self.memory, 0).astype(c.dtype) for c in self.columns}
         message = m.unpack([bytes(self.memory[:length])])
-        assert isinstance(message, m.Value)
-        assert isinstance(message.value, dict)
         self.columns = columns_of(message.value)
         return message.value
 

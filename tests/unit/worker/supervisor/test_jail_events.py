@@ -48,7 +48,6 @@ def test_what_a_jail_was_denied_is_known_when_it_is_ended(fails: bool) -> None:
         events.end(entry, whole_jail("protocol"))
         assert entry.denied == ([] if fails else ["socket AF_INET"])
         assert witness.failed.called is fails
-        assert entry.death is not None
         assert entry.death.reason == "protocol"
         assert jail.kill.called
 
@@ -71,5 +70,4 @@ def test_who_waits_for_a_jail_that_another_closes_hears_of_it(stepped: bool) -> 
         events.jail_gone(JailExited(jail, 0, None))
         assert [asker for asker, _ in said] == ["who steps", "who closes"]
         death = said[0][1]
-        assert isinstance(death, m.Death)
         assert (death.operation, death.detail) == ("step", "the jail was closed")

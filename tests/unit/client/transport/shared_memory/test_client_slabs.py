@@ -38,7 +38,6 @@ def slab_of() -> Iterator[Callable[..., ObservationSlab]]:
 
     def make(space: Any, slots: int = 1) -> ObservationSlab:
         layout = slabs.observation_layout(space, COUNT, slots)
-        assert layout is not None
         made.append(ObservationSlab(space, layout))
         return made[-1]
 

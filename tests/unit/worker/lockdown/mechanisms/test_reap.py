@@ -25,7 +25,6 @@ def test_a_child_after_the_last_look_is_killed_too(monkeypatch: pytest.MonkeyPat
     """A fork that had begun when its process was stopped may end after we looked, at any time."""
     monkeypatch.setattr(reap, "PATIENCE_S", 1.0)
     with subprocess.Popen([sys.executable, "-c", TREE], stdout=subprocess.PIPE) as root:
-        assert root.stdout is not None
         for _ in range(3):
             root.stdout.readline()
         first, second = procfs.descendants(root.pid)
@@ -64,7 +63,6 @@ time.sleep(600)
 
 def test_a_process_whose_first_thread_has_ended_is_killed_too() -> None:
     with subprocess.Popen([sys.executable, "-c", LEADERLESS], stdout=subprocess.PIPE) as root:
-        assert root.stdout is not None
         assert root.stdout.readline() == b"up\n"
         (pid,) = procfs.descendants(root.pid)
         assert (_state(pid), len(os.listdir(f"/proc/{pid}/task"))) == ("Z", 2)
