@@ -99,7 +99,6 @@ def test_what_ci_takes_has_inputs_and_hooks_that_there_are(checkout: Any) -> Non
     [hooks] = [document for document in parsed if "repos" in document]
     action = yaml.safe_load((checkout / "action.yml").read_text())
     for workflow in workflows:
-        step = workflow["jobs"]["check"]["steps"][-1]
-        assert set(step["with"]) <= set(action["inputs"])
+        assert set(workflow["jobs"]["check"]["steps"][-1]["with"]) <= set(action["inputs"])
     there = yaml.safe_load((checkout / ".pre-commit-hooks.yaml").read_text())
     assert {one["id"] for one in hooks["repos"][0]["hooks"]} <= {one["id"] for one in there}

@@ -210,8 +210,7 @@ def test_what_was_not_judged_is_told_in_every_form() -> None:
     made = mixed()
     made.waiting = ["a / 0", "b / 1"]
     made.stopped(900, "a / 0")
-    first = made.findings[0]
-    assert (first.id, made.failures(Severity.ERROR)[0].id) == ("runs", "runs")
+    assert (made.findings[0].id, made.failures(Severity.ERROR)[0].id) == ("runs", "runs")
     [ended] = [one for one in made.findings if one.id == "deadline"]
     assert "ended after 15 min 0 s, at: a / 0. Not judged: requirements, " in ended.message
     assert ended.message.endswith("all of b / 1")

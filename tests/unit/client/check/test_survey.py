@@ -172,8 +172,7 @@ _HONEST = [
 
 
 def test_honest_code_is_not_named(tmp_path: Path) -> None:
-    named = {text: told for text, told in of_each(tmp_path / "r", _HONEST).items() if told}
-    assert named == {}
+    assert {text: told for text, told in of_each(tmp_path / "r", _HONEST).items() if told} == {}
 
 
 @pytest.mark.parametrize(

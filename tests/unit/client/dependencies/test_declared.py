@@ -180,8 +180,7 @@ def test_the_most_particular_file_counts(tmp_path: Path) -> None:
     project = "[project]\nname = 'x'\nrequires-python = '>=3.11'\ndependencies = ['of-project']\n"
     assert repository(tmp_path) is None
     assert found(pyproject__toml=project) == ("pyproject.toml", ["of-project"], ">=3.11")
-    of_file = found(requirements__txt="of-file\n")
-    assert of_file == ("requirements.txt", ["of-file"], ">=3.11")
+    assert found(requirements__txt="of-file\n") == ("requirements.txt", ["of-file"], ">=3.11")
     text = script("requires-python = '<3.13'", "dependencies = [", "  'of-script',", "]")
     assert found(env__py=text) == ("env.py", ["of-script"], "<3.13")
 

@@ -193,8 +193,7 @@ def test_killed_makers_leave_nothing_that_is_used(index: Index, tmp_path: Path, 
         process.wait()
     assert left_behind() != []
     assert environments.every() == []
-    env = made(folder)
-    assert (env.packages / "wanted/__init__.py").is_file()
+    assert (made(folder).packages / "wanted/__init__.py").is_file()
     assert left_behind() == []
 
 

@@ -156,8 +156,7 @@ def test_only_what_is_missing_makes_an_environment(tmp_path: Path) -> None:
         assert request_of(found, HOST) is None
         request = request_of(found, AUTO)
         assert (request is not None and not HERE.meets(request)) == auto
-        always = request_of(found, own)
-        assert always.always
+        assert request_of(found, own).always
 
 
 def test_this_interpreter_without_its_packages_comes_first(tmp_path: Path) -> None:

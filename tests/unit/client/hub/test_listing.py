@@ -7,35 +7,29 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
-from envhub_sandbox.hub.listing import (
-    FileRecord,
-    Snapshot,
-    SnapshotLimits,
-    check_listing_names,
-    listing_within_limits,
-)
+from envhub_sandbox.hub import listing
 from envhub_sandbox.hub.reference import HubRef
 from envhub_worker.protocol.runtime import read_hub_copies
 
 DIGEST = "sha256:" + "0" * 64
 
 
-def record(path: str, size: int = 1) -> FileRecord:
-    return FileRecord(path, size, DIGEST)
+def record(path: str, size: int = 1) -> listing.FileRecord:
+    return listing.FileRecord(path, size, DIGEST)
 
 
 @pytest.mark.parametrize("value", [0, -1, True, 1.5, "9", None])
 def test_limit_must_be_a_positive_int(value: object) -> None:
     with pytest.raises(PolicyError, match="max_files"):
-        SnapshotLimits(max_files=value)  # type: ignore[arg-type]
+        listing.SnapshotLimits(max_files=value)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="max_size"):
-        SnapshotLimits(max_size=1)  # type: ignore[call-arg]
+        listing.SnapshotLimits(max_size=1)  # type: ignore[call-arg]
 
 
 def test_listing_exactly_at_the_limits_passes_sorted() -> None:
-    limits = SnapshotLimits(max_bytes=5, max_files=2, max_file_bytes=3)
+    limits = listing.SnapshotLimits(max_bytes=5, max_files=2, max_file_bytes=3)
     files = [record("b", 3), record("a", 2)]
-    assert [file.path for file in listing_within_limits(files, limits, "t")] == ["a", "b"]
+    assert [file.path for file in listing.listing_within_limits(files, limits, "t")] == ["a", "b"]
 
 
 def test_limit_stops_reading_the_listing() -> None:
@@ -47,7 +41,7 @@ def test_limit_stops_reading_the_listing() -> None:
             yield record(str(len(read)))
 
     with pytest.raises(SnapshotTooLargeError, match=r"SnapshotLimits\(max_files=\.\.\.\)"):
-        listing_within_limits(endless(), SnapshotLimits(max_files=3), "t")  # type: ignore[arg-type]
+        listing.listing_within_limits(endless(), listing.SnapshotLimits(max_files=3), "t")  # type: ignore[arg-type]
     assert len(read) == 4
 
 
@@ -64,18 +58,20 @@ def test_limit_stops_reading_the_listing() -> None:
 def test_hostile_name_is_refused(path: str) -> None:
     """A name that could climb, hide, or break a file system names itself in the error."""
     with pytest.raises(SnapshotError, match="refused"):
-        check_listing_names([record("env.py"), record(path)], "t")
+        listing.check_listing_names([record("env.py"), record(path)], "t")
 
 
 @pytest.mark.parametrize("paths", [["a", "a"], ["a", "a/b"], ["a/b/c", "a/b"]])
 def test_names_that_clash_are_refused(paths: list[str]) -> None:
     """Two files of one name, or a file that is also a folder, cannot both be laid out."""
     with pytest.raises(SnapshotError, match=r"listed twice|both a file and a folder"):
-        check_listing_names(map(record, paths), "t")
+        listing.check_listing_names(map(record, paths), "t")
 
 
 def test_ordinary_names_pass() -> None:
-    check_listing_names(map(record, [".gitattributes", "A.py", "a.py", "my env/ж.txt", "..a"]), "t")
+    listing.check_listing_names(
+        map(record, [".gitattributes", "A.py", "a.py", "my env/ж.txt", "..a"]), "t"
+    )
 
 
 @settings(max_examples=30)
@@ -83,7 +79,7 @@ def test_ordinary_names_pass() -> None:
 def test_accepted_names_stay_below_the_root(names: list[str]) -> None:
     root = Path("/store/tree")
     try:
-        check_listing_names(map(record, names), "t")
+        listing.check_listing_names(map(record, names), "t")
     except SnapshotError:
         return
     for name in names:
@@ -106,6 +102,6 @@ def test_accepted_names_stay_below_the_root(names: list[str]) -> None:
 )
 def test_every_revision_of_a_reference_can_be_opened(revision: str, found: tuple[str, ...]) -> None:
     asked = HubRef.parse(f"org/repo@{revision}").revision
-    snapshot = Snapshot("org/repo", "model", "a" * 40, "env.py", Path("/x"), (), asked)
+    snapshot = listing.Snapshot("org/repo", "model", "a" * 40, "env.py", Path("/x"), (), asked)
     [copy] = read_hub_copies(snapshot.hub_copies)
     assert copy.revisions == found

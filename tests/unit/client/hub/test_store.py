@@ -84,8 +84,7 @@ def test_every_user_can_only_read_it(snapshot_store: Path, slot: store.Slot, mas
     finally:
         os.umask(before)
     for path in [slot.tree, *slot.tree.rglob("*")]:
-        mode = stat.S_IMODE(path.lstat().st_mode)
-        assert mode == (0o555 if path.is_dir() else 0o444), path
+        assert stat.S_IMODE(path.lstat().st_mode) == (0o555 if path.is_dir() else 0o444), path
     above = [path for path in slot.tree.parents if path.is_relative_to(snapshot_store)]
     assert all(stat.S_IMODE(path.stat().st_mode) == 0o755 for path in above)
     assert stat.S_IMODE(slot.record.stat().st_mode) == 0o600

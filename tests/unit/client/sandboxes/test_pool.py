@@ -284,8 +284,7 @@ def test_only_idle_containers_change_hands(monkeypatch: pytest.MonkeyPatch, pool
     assert one.server is not two.server
     two.release()
     one.release()
-    again = sandbox().acquire(Path("/"))
-    assert again.server is one.server
+    assert sandbox().acquire(Path("/")).server is one.server
     other = sandbox().acquire(Path("/"), idle_s=600)
     other.release()
     further = sandbox("/two").acquire(Path("/")), sandbox(network="loopback").acquire(Path("/"))

@@ -15,16 +15,7 @@ import pytest
 from envhub_sandbox.errors import SandboxUnavailableError
 from envhub_sandbox.extras.docker import leftovers
 from envhub_sandbox.extras.docker.run_arguments import FOLDER_LABEL, USER_LABEL
-from envhub_sandbox.sandboxes.process import (
-    CONTAINER,
-    SERVER,
-    LocalServer,
-    RuntimeFolder,
-    is_in_use,
-    places,
-    remove_stale,
-    stale_folders,
-)
+from envhub_sandbox.sandboxes import process
 from envhub_sandbox.system.locks import LifeLock
 from envhub_sandbox.system.platform import has_ended
 from envhub_worker.lockdown.limits.cgroups import Hierarchy, Tree
@@ -35,8 +26,8 @@ DEAF = "import os, signal; signal.signal(15, signal.SIG_IGN); os.close(1); os.re
 
 
 @pytest.fixture
-def server() -> Iterator[LocalServer]:
-    made = LocalServer(SERVER, "", 0.2)
+def server() -> Iterator[process.LocalServer]:
+    made = process.LocalServer(process.SERVER, "", 0.2)
     yield made
     made.stop()
 
@@ -52,7 +43,7 @@ def listen(path: str) -> socket.socket:
     return found
 
 
-def test_it_runs_while_it_can_be_reached(server: LocalServer) -> None:
+def test_it_runs_while_it_can_be_reached(server: process.LocalServer) -> None:
     """Its process lives, and both sockets are there: a cleaner may have removed them."""
     with server.starting(sleeping) as ready:
         assert os.read(ready, 1) == b"1"
@@ -68,7 +59,7 @@ def test_it_runs_while_it_can_be_reached(server: LocalServer) -> None:
             assert eventually(lambda: not server.runs)
 
 
-def test_stop_leaves_nothing(server: LocalServer) -> None:
+def test_stop_leaves_nothing(server: process.LocalServer) -> None:
     """Neither the process, nor the folder, nor a descriptor; a second one closes nothing else."""
     with server.starting(sleeping):
         assert server.folder.stat().st_mode & 0o777 == 0o700
@@ -84,7 +75,7 @@ def test_stop_leaves_nothing(server: LocalServer) -> None:
         os.close(fd)
 
 
-def test_one_that_does_not_end_is_killed(server: LocalServer) -> None:
+def test_one_that_does_not_end_is_killed(server: process.LocalServer) -> None:
     started = [sys.executable, "-c", DEAF]
     child = subprocess.Popen(started, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     with child.stdin, child.stdout, server.starting(lambda _: child):
@@ -93,7 +84,7 @@ def test_one_that_does_not_end_is_killed(server: LocalServer) -> None:
         assert child.returncode == -signal.SIGKILL
 
 
-def test_what_fails_in_its_start_ends_it(server: LocalServer) -> None:
+def test_what_fails_in_its_start_ends_it(server: process.LocalServer) -> None:
     with pytest.raises(KeyboardInterrupt), server.starting(sleeping):
         raise KeyboardInterrupt
     assert has_ended(server.process.pid)
@@ -102,13 +93,13 @@ def test_what_fails_in_its_start_ends_it(server: LocalServer) -> None:
     def fails(ready: int) -> subprocess.Popen[bytes]:
         raise FileNotFoundError("no interpreter")
 
-    second = LocalServer(SERVER, "", 0.2)
+    second = process.LocalServer(process.SERVER, "", 0.2)
     with pytest.raises(FileNotFoundError), second.starting(fails):
         pass
     assert (second.stopped, second.folder.exists()) == (True, False)
 
 
-def test_a_fork_of_its_owner_ends_nothing(server: LocalServer) -> None:
+def test_a_fork_of_its_owner_ends_nothing(server: process.LocalServer) -> None:
     with server.starting(sleeping):
         pass
     child = os.fork()
@@ -135,7 +126,7 @@ def folder(root: Path, name: str, files: dict[str, str], mode: int = 0o700) -> P
 
 
 def found(root: Path) -> set[str]:
-    return {path.name for path in stale_folders(root)}
+    return {path.name for path in process.stale_folders(root)}
 
 
 def alive(root: Path, name: str) -> Path:
@@ -161,7 +152,7 @@ def test_a_folder_is_left_with_its_client(tmp_path: Path, monkeypatch: pytest.Mo
     folder(tmp_path, "envhub-docker-not-ours-at-all", {"alive": ""})
     folder(tmp_path, "envhub-docker-open0000", {"alive": ""}, mode=0o755)
     there = set(tmp_path.iterdir())
-    [path] = stale_folders(tmp_path)
+    [path] = process.stale_folders(tmp_path)
     assert path.name == "envhub-docker-dead0000"
     with monkeypatch.context() as patch:
         patch.setattr("envhub_sandbox.sandboxes.process.user_id", lambda: os.geteuid() + 1)
@@ -206,7 +197,7 @@ def test_others_are_removed_by_hand_only(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setattr("envhub_sandbox.sandboxes.process.places", lambda: [tmp_path])
     assert found(tmp_path) == {"envhub-dead0000", "envhub-another0"}
-    assert [path.name for path in remove_stale()] == ["envhub-dead0000"]
+    assert [path.name for path in process.remove_stale()] == ["envhub-dead0000"]
     assert [path.name for path in tmp_path.iterdir()] == ["envhub-another0"]
 
 
@@ -214,18 +205,18 @@ def test_a_path_for_sockets_is_short(tmp_path: Path, monkeypatch: pytest.MonkeyP
     long = tmp_path / ("x" * 100)
     long.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(long))
-    made = RuntimeFolder(CONTAINER)
+    made = process.RuntimeFolder(process.CONTAINER)
     try:
         assert len(os.fsencode(made.path / "sockets" / "server")) <= 107
         assert made.path.stat().st_mode & 0o777 == 0o700
-        assert made.path.parent in places()
-        assert is_in_use(made.path)
+        assert made.path.parent in process.places()
+        assert process.is_in_use(made.path)
     finally:
         made.remove()
     assert not made.path.exists()
     monkeypatch.setattr("envhub_sandbox.sandboxes.process.places", lambda: [long])
     with pytest.raises(SandboxUnavailableError, match="set TMPDIR to a shorter path"):
-        RuntimeFolder(SERVER)
+        process.RuntimeFolder(process.SERVER)
 
 
 def test_control_groups_of_ended_servers_are_left_behind(tmp_path: Path) -> None:

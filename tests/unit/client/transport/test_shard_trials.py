@@ -78,8 +78,7 @@ def test_another_load_lets_all_be_tried_again(path: Path) -> None:
 
 def test_what_was_far_slower_is_not_tried_again(path: Path) -> None:
     times = {"2+2": 1e-3, "3+1": 1.1e-3, "4": 1.9e-3}
-    tried = [use(path, times, 4) for _ in range(4)]
-    assert tried == ["2+2", "3+1", "4", "2+2"]
+    assert [use(path, times, 4) for _ in range(4)] == ["2+2", "3+1", "4", "2+2"]
     slower = {name: 2 * step_s for name, step_s in times.items()}
     assert [use(path, slower, 4) for _ in range(4)] == ["2+2", "3+1", "2+2", "2+2"]
 

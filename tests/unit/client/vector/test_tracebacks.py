@@ -57,8 +57,7 @@ def frames(error: BaseException, asking: Callable[..., None] = ask) -> list[str]
 @pytest.mark.parametrize("asking", [ask, ask_by_another])
 def test_one_frame_of_ours_is_left(error: errors.EnvHubError, asking: Callable[..., None]) -> None:
     assert frames(error, asking) == ["asked"]
-    last = error.__traceback__.tb_next
-    assert last.tb_frame.f_locals["__tracebackhide__"] is True
+    assert error.__traceback__.tb_next.tb_frame.f_locals["__tracebackhide__"] is True
     [*_, shown] = traceback.extract_tb(error.__traceback__)
     assert shown.line.endswith("# ENVHUB_TRACEBACK=full shows where")
 

@@ -115,8 +115,7 @@ def test_misaligned_frames_give_aligned_arrays() -> None:
     """A transport may cut frames out of one buffer anywhere; native code needs alignment."""
     frame = memoryview(bytes(1 + 8 * LARGE))[1:]
     reader = ArrayReader(b"", [frame], DEFAULT_LIMITS)
-    array = reader.take(descriptor(11, LARGE, frame=True))
-    assert array.flags.aligned
+    assert reader.take(descriptor(11, LARGE, frame=True)).flags.aligned
 
 
 @pytest.mark.parametrize(

@@ -158,8 +158,7 @@ def test_keys_that_look_alike_are_numbered() -> None:
     first, second, *_ = mapping
     assert (second.type_name, second.text) == (first.type_name, f"{first.text} #2")
     assert len(through(set(objects))) == 100
-    nested = through({(objects[0], 1): "a", (objects[1], 1): "b"})
-    assert list(nested.values()) == ["a", "b"]
+    assert list(through({(objects[0], 1): "a", (objects[1], 1): "b"}).values()) == ["a", "b"]
 
 
 def test_keys_that_cannot_be_hashed_here_are_described() -> None:
@@ -224,8 +223,7 @@ def test_torch_tensors_arrive_as_tensors_or_arrays() -> None:
         torch.nn.Parameter(torch.ones(2)),
     ]
     made = through(source, tensors=lambda array, name: (name, array))
-    names = [name for name, _ in made]
-    assert names == ["float32", "complex64", "bool", "bfloat16", "float32"]
+    assert [name for name, _ in made] == ["float32", "complex64", "bool", "bfloat16", "float32"]
     arrays: Any = through(source)
     for tensor, array in zip(source, arrays, strict=True):
         wide = tensor.detach().resolve_conj()

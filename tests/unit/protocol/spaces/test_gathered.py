@@ -9,15 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from envhub_worker.protocol.spaces.batches import (
-    APART,
-    Misfit,
-    check_infos,
-    gather_infos,
-    is_apart,
-    join_infos,
-    join_pairs,
-)
+from envhub_worker.protocol.spaces import batches
 from tests.compliance.test_join_infos import INFO
 from tests.support.compare import assert_same
 
@@ -31,7 +23,7 @@ def cut(infos: list[dict[str, Any]], data: st.DataObject) -> list[list[dict[str,
 
 
 def joined(infos: list[dict[str, Any]]) -> dict[Any, Any]:
-    return join_pairs(list(enumerate(infos)), len(infos))
+    return batches.join_pairs(list(enumerate(infos)), len(infos))
 
 
 @given(st.lists(INFO, min_size=1, max_size=6), st.data())
@@ -42,10 +34,10 @@ def test_what_fits_is_joined_as_ever(infos: list[dict[str, Any]], data: st.DataO
         warnings.simplefilter("ignore", RuntimeWarning)
         try:
             each = [joined(part) for part in parts]
-            wanted = join_infos(each, sizes)
+            wanted = batches.join_infos(each, sizes)
         except Exception:
             return
-    assert_same(wanted, gather_infos(each, sizes, _ROOM), "infos")
+    assert_same(wanted, batches.gather_infos(each, sizes, _ROOM), "infos")
 
 
 ANY = st.one_of(
@@ -67,7 +59,7 @@ UNLIKE = st.fixed_dictionaries({}, optional={"one": ANY, "other": ANY})
 @example([{"other": {"b": ""}}, {"other": {"a": 0, "b": ""}}, {"other": 0}])
 def test_each_has_its_own_whatever_the_others_say(infos: list[dict[str, Any]]) -> None:
     each, sizes = [joined([info]) for info in infos], [1] * len(infos)
-    gathered = gather_infos(each, sizes, _ROOM)
+    gathered = batches.gather_infos(each, sizes, _ROOM)
     for index, info in enumerate(infos):
         for key in ("one", "other"):
             assert_same(info.get(key), member(gathered, key, index), key)
@@ -94,10 +86,10 @@ def test_a_few_bytes_make_no_large_column() -> None:
     """A worker's large array is its own; as a column of all it would be a hundred times that."""
     large = joined([{"large": np.zeros(1 << 17, np.uint8)}])
     few = joined([{"large": np.ones(1 << 17, np.uint8)}])
-    gathered = gather_infos([large, *[few] * 99], [1] * 100, _ROOM)
+    gathered = batches.gather_infos([large, *[few] * 99], [1] * 100, _ROOM)
     assert gathered["large"].dtype == object
     assert [int(one[0]) for one in gathered["large"]] == [0, *[1] * 99]
-    assert gather_infos([large, few], [1, 1], _ROOM)["large"].shape == (2, 1 << 17)
+    assert batches.gather_infos([large, few], [1, 1], _ROOM)["large"].shape == (2, 1 << 17)
 
 
 @pytest.mark.parametrize(
@@ -107,15 +99,15 @@ def test_lies_about_masks_do_no_harm(mask: Any) -> None:
     lie = {"x": np.array([1]), "_x": mask}
     honest = joined([{"x": 0.5}])
     for each in ([lie, honest], [honest, lie]):
-        gathered = gather_infos(each, [1, 1], _ROOM)
+        gathered = batches.gather_infos(each, [1, 1], _ROOM)
         at = each.index(honest) if each[0] is honest else 1
         assert gathered["x"][at] == 0.5
         assert bool(gathered["_x"][at])
 
 
 def test_the_control_does_not_fit() -> None:
-    with pytest.raises(Misfit):
-        join_infos([joined([{"x": 1}]), joined([{"x": 0.5}])], [1, 1])
+    with pytest.raises(batches.Misfit):
+        batches.join_infos([joined([{"x": 1}]), joined([{"x": 0.5}])], [1, 1])
 
 
 _ODD = st.sampled_from(
@@ -136,17 +128,17 @@ _LIES = st.dictionaries(_KEYS, _DEEPER, max_size=5)
 @given(st.lists(_LIES, min_size=2, max_size=4))
 def test_nothing_that_is_let_in_keeps_others_back(lies: list[dict[Any, Any]]) -> None:
     for lie in lies:
-        check_infos(lie, 1)
-    gather_infos(lies, [1] * len(lies), _ROOM)
+        batches.check_infos(lie, 1)
+    batches.gather_infos(lies, [1] * len(lies), _ROOM)
 
 
 @pytest.mark.parametrize("value", [1, "x", [1], None, np.zeros(2), np.zeros(()), {"y": [1]}])
 def test_what_has_no_row_for_each_is_refused(value: Any) -> None:
-    with pytest.raises(Misfit):
-        check_infos({"x": value}, 1)
+    with pytest.raises(batches.Misfit):
+        batches.check_infos({"x": value}, 1)
 
 
 def test_what_is_to_be_asked_for_apart_is_known() -> None:
-    assert is_apart(dict(APART))
+    assert batches.is_apart(dict(batches.APART))
     for lie in ({}, {None: np.zeros(2)}, {None: 0}, {None: None, "x": 1}, {"x": None}):
-        assert not is_apart(lie)
+        assert not batches.is_apart(lie)

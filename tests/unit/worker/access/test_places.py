@@ -92,8 +92,7 @@ def test_a_session_without_connections_and_jails_is_forgotten() -> None:
     places(120, sessions, jails, MagicMock(), frozenset({3})).tick()
     assert [one.name for one in sessions.all()] == [b"b", b"c"]
     assert jails.ended == []
-    gone = longest_gone(sessions.all())
-    assert gone.name == b"b"
+    assert longest_gone(sessions.all()).name == b"b"
     assert longest_gone([]) is None
 
 

@@ -77,8 +77,7 @@ def test_the_contract_is_there_and_it_warns_once() -> None:
     assert dataclasses.asdict(made)["hub_path"] == "org/repo"
     own = configs.EnvConfig.register_subclass("own")(type("Own", (configs.EnvConfig,), {}))
     assert own().gym_kwargs == {}
-    feature = types.PolicyFeature(type=types.FeatureType.ACTION, shape=(2,))
-    assert feature.type == "ACTION"
+    assert types.PolicyFeature(type=types.FeatureType.ACTION, shape=(2,)).type == "ACTION"
     assert constants.OBS_IMAGES == "observation.images"
 
 

@@ -15,11 +15,7 @@ from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.shared_memory.served_lane import (
-    ReceivedBatch,
-    ServedLane,
-    ServedShard,
-)
+from envhub_sandbox.transport.shared_memory import served_lane
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.shared_memory import slabs
@@ -45,8 +41,8 @@ class Both:
     def __init__(self, space: Any) -> None:
         self.layout = slabs.layout_of(ACTIONS, COUNT)
         self.observed = slabs.observation_layout(space, COUNT, 1)
-        self.shard = ServedShard(self.layout, self.observed)
-        self.batch = ReceivedBatch(space, [self.shard])
+        self.shard = served_lane.ServedShard(self.layout, self.observed)
+        self.batch = served_lane.ReceivedBatch(space, [self.shard])
         self.server = ServedSlabs(*self.shard.sizes)
         self.memory = [
             memoryview(memory(fd, size))
@@ -123,7 +119,7 @@ def test_actions_arrive_with_their_dtypes() -> None:
 
 def test_a_space_without_members_has_no_actions_to_write() -> None:
     layout, observed = slabs.layout_of(spaces.Dict({}), 1), slabs.observation_layout(SMALL, 1, 1)
-    assert ServedShard(layout, observed).ask([], 0)
+    assert served_lane.ServedShard(layout, observed).ask([], 0)
 
 
 def test_columns_follow_their_schema() -> None:
@@ -136,7 +132,7 @@ def test_columns_follow_their_schema() -> None:
     assert both.answer(slabs.COLUMNS, columns, length=0) == (slabs.COLUMNS, None)
     found = both.shard.columns()
     assert (found["a"].tolist(), found["_a"].tolist()) == ([7, 8, 9], [True, True, False])
-    fresh = ServedShard(both.layout, both.observed)
+    fresh = served_lane.ServedShard(both.layout, both.observed)
     assert (both.shard.known > 0, fresh.known) == (True, 0)
     with pytest.raises(errors.RemoteProtocolError, match="before their schema"):
         fresh.columns()
@@ -153,8 +149,8 @@ class Served:
             single_observation_space=SMALL, single_action_space=spaces.Discrete(99), num_envs=shards
         )
         results = Results(manifest, bounds)
-        lane = ServedLane.open(Lane(jail, runners, 7, results), Deadline(0))
-        assert isinstance(lane, ServedLane)
+        lane = served_lane.ServedLane.open(Lane(jail, runners, 7, results), Deadline(0))
+        assert isinstance(lane, served_lane.ServedLane)
         self.lane, self._shards = lane, shards
 
     def step(self, action: int = 0, *, ahead: bool = False) -> bool:

@@ -7,12 +7,7 @@ from pathlib import Path
 import pytest
 
 from envhub_worker.extras.access.quotas import Quotas
-from envhub_worker.extras.access.store.blob_store import (
-    BLOCK_BYTES,
-    BlobStore,
-    ListedFile,
-    SharedUse,
-)
+from envhub_worker.extras.access.store import blob_store
 from envhub_worker.extras.access.store.uploads import Uploads
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
@@ -82,18 +77,18 @@ def test_only_one_that_is_alone_makes_room(tmp_path: Path) -> None:
 
 
 def test_a_share_is_taken_back_after_a_vain_try(tmp_path: Path) -> None:
-    uses = [SharedUse(tmp_path / "lock") for _ in range(2)]
+    uses = [blob_store.SharedUse(tmp_path / "lock") for _ in range(2)]
     for use, expected in ((uses[0], True), (uses[1], False), (uses[0], False), (uses[1], False)):
         with use.alone() as alone:
             assert alone is expected
 
 
 def test_a_tree_that_cannot_be_finished_leaves_nothing(tmp_path: Path) -> None:
-    store, part = BlobStore(tmp_path), tmp_path / "part"
+    store, part = blob_store.BlobStore(tmp_path), tmp_path / "part"
     part.write_bytes(b"1")
     sha256 = hashlib.sha256(b"1").digest()
     store.take(part, sha256, 1)
     with pytest.raises(RefusedError):
-        store.lay_out("ab", [ListedFile("env.py", 2, sha256)], lambda size: None)
+        store.lay_out("ab", [blob_store.ListedFile("env.py", 2, sha256)], lambda size: None)
     assert list((tmp_path / "trees").iterdir()) == []
-    assert store.held == BLOCK_BYTES
+    assert store.held == blob_store.BLOCK_BYTES
