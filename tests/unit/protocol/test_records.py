@@ -130,7 +130,7 @@ def test_a_notebook_shows_the_fields() -> None:
         str(one) for one in theirs.values() if one.name != "third"
     ]
     assert ours["third"].default == []
-    assert str(inspect.signature(Named)) == "(*, only: 'int')"
+    assert str(inspect.signature(Named)) == "(*, only: int)"
 
 
 def test_subclasses_add_fields() -> None:
