@@ -41,9 +41,8 @@ _COMMANDS = dict(commands())
 
 
 def help_of(name: str, width: int = _WIDTH, option: str = "--help-all") -> str:
-    done = CliRunner().invoke(
-        app, [*name.split(), option], env={"COLUMNS": str(width), "TERM": "dumb"}
-    )
+    env = {"COLUMNS": str(width), "TERM": "dumb"}
+    done = CliRunner().invoke(app, [*name.split(), option], env=env)
     assert done.exit_code == 0, done.output
     return done.output
 

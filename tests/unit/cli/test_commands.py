@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -24,7 +24,6 @@ from envhub_sandbox.extras.judge import reports
 from envhub_sandbox.extras.judge.command import findings
 from envhub_sandbox.extras.judge.findings import Finding, Report
 from envhub_sandbox.extras.remote import doctor as doctor_server
-from envhub_sandbox.extras.remote.sandbox import RemoteSandbox
 from envhub_sandbox.extras.sources.checkout import make_checkout
 from envhub_sandbox.extras.starter import command as init
 from envhub_worker.protocol import messages as m
@@ -240,9 +239,7 @@ def looks() -> Iterator[Examine]:
         def run(said: dict[Any, Any], profile: str = "no-userns", *, json: bool = False) -> Exit:
             answer = m.Sessions((), said)
             server.lies[m.GetSessions] = lambda asked: [asked.answer(answer)]
-            return doctor_server.examine_server(
-                cast("RemoteSandbox", _Place(server)), profile, json=json
-            )
+            return doctor_server.examine_server(_Place(server), profile, json=json)
 
         yield run
 

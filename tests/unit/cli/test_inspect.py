@@ -49,9 +49,8 @@ def test_a_repository_is_read(tmp_path: Path) -> None:
     assert read["reference"] == f"{folder}:env.py"
     arguments = "n_envs=1, use_async_envs=False, size=8"
     assert read["entry"] == {"file": "env.py", "make_env": [{"arguments": arguments, "line": 4}]}
-    assert [one["path"] for one in read["files"]] == [
-        *("LICENSE", "README.md", "env.py", "requirements.txt")
-    ]
+    paths = [one["path"] for one in read["files"]]
+    assert paths == ["LICENSE", "README.md", "env.py", "requirements.txt"]
     assert read["declared"]["packages"] == ["PyYAML>=6", "gymnasium"]
     assert [(one["name"], one["brought"]) for one in read["imports"]] == [
         *(("gymnasium", True), ("yaml", False))

@@ -30,9 +30,7 @@ print(getattr(build_meta, sys.argv[1])(sys.argv[2]))
 def built(kind: str, source: Path, into: Path) -> Path:
     into.mkdir(exist_ok=True)
     command = [sys.executable, "-c", BUILD, f"build_{kind}", str(into)]
-    done = subprocess.run(
-        command, cwd=source, capture_output=True, text=True, timeout=250, check=False
-    )
+    done = subprocess.run(command, cwd=source, capture_output=True, text=True, timeout=250)
     assert done.returncode == 0, done.stderr
     return into / done.stdout.splitlines()[-1]
 
@@ -129,9 +127,8 @@ def test_the_workers_group_is_what_the_worker_imports(project: dict[str, Any]) -
 
 
 def test_the_image_can_be_watched(project: dict[str, Any]) -> None:
-    installed = re.findall(
-        r"--require-hashes -r /build/(\S+)", (CHECKOUT / "Dockerfile").read_text()
-    )
+    recipe = (CHECKOUT / "Dockerfile").read_text()
+    installed = re.findall(r"--require-hashes -r /build/(\S+)", recipe)
     group = project["dependency-groups"]["image"]
     assert installed == ["image.txt"]
     assert "--group image --output" in (CHECKOUT / ".ci/lock.sh").read_text()

@@ -243,7 +243,7 @@ def test_the_table_permits_no_arrow_that_nobody_uses() -> None:
         if target in modules()
     }
     permitted = {
-        (package, target) for package in MAY_IMPORT for target in may_import(package) - LOWEST
+        (source, target) for source in MAY_IMPORT for target in may_import(source) - LOWEST
     }
     assert permitted - used == set()
     graph = {package: may_import(package) - {package} for package in MAY_IMPORT}

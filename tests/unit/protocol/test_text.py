@@ -95,9 +95,7 @@ def test_times_are_said_in_the_unit_that_people_read(seconds: float, said: str) 
 
 
 def test_one_is_no_plural() -> None:
-    assert [counted(n, "finding") for n in (0, 1, 2_000)] == [
-        *("0 findings", "1 finding", "2,000 findings")
-    ]
-    assert [counted(n, "check holds", "checks hold") for n in (1, 2)] == [
-        *("1 check holds", "2 checks hold")
-    ]
+    findings = [counted(number, "finding") for number in (0, 1, 2_000)]
+    assert findings == ["0 findings", "1 finding", "2,000 findings"]
+    checks = [counted(number, "check holds", "checks hold") for number in (1, 2)]
+    assert checks == ["1 check holds", "2 checks hold"]

@@ -114,9 +114,7 @@ def test_few_values_have_wide_bars_with_their_labels_below(count: int) -> None:
 
 
 def test_bars_stand_for_their_numbers() -> None:
-    high, low, below = (
-        one for one in ElementTree.fromstring(bar_plot("x", [4, 2, -2])) if len(one)
-    )
+    high, low, below = filter(len, ElementTree.fromstring(bar_plot("x", [4, 2, -2])))
     assert float(high.attrib["height"]) == pytest.approx(2 * float(low.attrib["height"]), abs=0.2)
     assert float(below.attrib["height"]) == pytest.approx(float(low.attrib["height"]), abs=0.2)
     ground = float(low.attrib["y"]) + float(low.attrib["height"])

@@ -13,13 +13,11 @@ def test_a_policy_is_a_file(tmp_path: Path) -> None:
     """Options change what it says, limit by limit, and nothing else of it."""
     file = tmp_path / "policy.toml"
     file.write_text('network = "loopback"\n[limits]\nprocesses = 9\nopen_files = 64\n')
-    made = policy_from(
-        settings.merged_settings(settings.read_file(file), {"limits": {"processes": 12}}), None
-    )
+    options = {"limits": {"processes": 12}}
+    made = policy_from(settings.merged_settings(settings.read_file(file), options), None)
     assert (made.network, made.limits.processes, made.limits.open_files) == ("loopback", 12, 64)
-    assert made == policy_from(
-        {"network": "loopback", "limits": {"processes": 12, "open_files": 64}}, None
-    )
+    limits = {"processes": 12, "open_files": 64}
+    assert made == policy_from({"network": "loopback", "limits": limits}, None)
 
 
 @pytest.mark.parametrize(

@@ -368,10 +368,8 @@ def test_what_is_read_is_what_python_makes_of_the_bytes(source: bytes) -> None:
     if python is None or (described is not None and "encoding" in described):
         return
     read = {name for level, _, names, *_ in described["imports"] if level < 0 for name in names}
-    nodes = ast.walk(ast.parse(source))
-    assert read == {
-        one.name for node in nodes if isinstance(node, ast.Import) for one in node.names
-    }
+    imports = (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Import))
+    assert read == {alias.name for node in imports for alias in node.names}
     assert tree(source.decode("utf-8-sig")) == python
 
 

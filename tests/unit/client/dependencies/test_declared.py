@@ -30,9 +30,7 @@ def script(*lines: str) -> str:
 
 
 def test_plain_requirements_get_through(tmp_path: Path) -> None:
-    text = (
-        "# wanted\nnumpy>=2\n\n  # more\nminigrid[wfc]==3.0 # pinned\nfoo; python_version<'3.12'\n"
-    )
+    text = "# wanted\nnumpy>=2\n\n  # more\nminigrid[wfc]==3.0 # pinned\nfoo; python_version<'3.12'"
     assert plain(repository(tmp_path, requirements__txt=text)) == [
         *("numpy>=2", "minigrid[wfc]==3.0", 'foo; python_version < "3.12"')
     ]

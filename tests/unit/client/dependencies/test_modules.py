@@ -125,18 +125,16 @@ def test_no_index_is_asked_for_the_name_of_a_module(index: Index, tmp_path: Path
         assert packages_for(found, AUTO) is not None
     assert any("chess" in path for path in index.asked)
     assert not any("nobody" in path for path in index.asked)
-    said = MissingModule(found, "process", "auto", None, True).advice(
-        "No module named 'nobody_knows_this'"
-    )
+    missing = MissingModule(found, "process", "auto", None, True)
+    said = missing.advice("No module named 'nobody_knows_this'")
     assert "env.py, line 1 imports nobody_knows_this" in said
     assert "{'extra': ['NAME-OF-THE-PACKAGE']}" in said
     for module, said in (
         ("cv2.aruco", "{'extra': ['opencv-python-headless']}"),
         ("numpy.exceptions", "A package of another version has numpy.exceptions"),
     ):
-        advice = MissingModule(found, "process", "auto", None, True).advice(
-            f"No module named '{module}'"
-        )
+        missing = MissingModule(found, "process", "auto", None, True)
+        advice = missing.advice(f"No module named '{module}'")
         assert said in advice
 
 
@@ -266,9 +264,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def resolve(request: PackageRequest, target: Target, **options: Any) -> Lock:
         found.append(target.python)
         if any(one.requirement.name == "nowhere" for one in request.wanted):
-            raise DependencyError(
-                "Because nowhere was not found in the package registry", reason="resolution"
-            )
+            raise DependencyError("nowhere: not found in the package registry", reason="resolution")
         if target.python != "/opt/3.98.0" or request.wanted[0].requirement.name == "never":
             raise DependencyError(
                 "does not satisfy Python>=3.98 and a depends on Python>=3.98", reason="resolution"

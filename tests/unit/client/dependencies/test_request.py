@@ -60,9 +60,8 @@ def test_what_the_caller_says(tmp_path: Path) -> None:
     only, _ = chosen({"only": ["a>1"], "without": ["B_c"], "override": ["d<2"]}, None)
     assert (list(map(str, only.only or ())), only.infer) == (["a>1"], False)
     assert (only.without, list(map(str, only.override))) == (("b-c",), ["d<2"])
-    assert chosen({"exclude_newer": datetime.date(2026, 1, 31)}, None)[0].exclude_newer == (
-        "2026-01-31"
-    )
+    day = datetime.date(2026, 1, 31)
+    assert chosen({"exclude_newer": day}, None)[0].exclude_newer == "2026-01-31"
 
 
 @pytest.mark.parametrize(

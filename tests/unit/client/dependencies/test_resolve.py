@@ -79,9 +79,8 @@ def test_no_interpreter_of_somebody_elses_is_asked(
         (python.parent / name).symlink_to("python")
     command = [uv.command(), "pip", "compile", "-", *uv.NO_BUILDS, "--python-version", "3.12"]
     (tmp_path / "cwd").mkdir()
-    subprocess.run(
-        command, input=b"", capture_output=True, cwd=tmp_path / "cwd", env=places.environment()
-    )
+    env = places.environment()
+    subprocess.run(command, input=b"", capture_output=True, cwd=tmp_path / "cwd", env=env)
     assert (tmp_path / "asked").exists(), "the control asks nobody"
     (tmp_path / "asked").unlink()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))

@@ -69,9 +69,8 @@ def test_names_that_clash_are_refused(paths: list[str]) -> None:
 
 
 def test_ordinary_names_pass() -> None:
-    listing.check_listing_names(
-        map(record, [".gitattributes", "A.py", "a.py", "my env/ж.txt", "..a"]), "t"
-    )
+    names = [".gitattributes", "A.py", "a.py", "my env/ж.txt", "..a"]
+    listing.check_listing_names(map(record, names), "t")
 
 
 @settings(max_examples=30)

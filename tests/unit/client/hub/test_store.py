@@ -201,9 +201,8 @@ def test_copied_store_is_verified_by_content(
     """A store that moved to another disk has other inodes: it is hashed, and then works."""
     source = tmp_path / "envhub-cache"
     subprocess.run(["cp", "-r", str(source), str(tmp_path / "moved")], check=True)
-    moved = store.Slot(
-        tmp_path / "moved" / published.folder.relative_to(source), COMMIT, published.title
-    )
+    folder = tmp_path / "moved" / published.folder.relative_to(source)
+    moved = store.Slot(folder, COMMIT, published.title)
     assert store.load(moved) == records()
 
 

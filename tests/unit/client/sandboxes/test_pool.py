@@ -101,9 +101,8 @@ def test_a_start_delays_only_those_who_want_the_same(pool: Pool) -> None:
         return started[-1]
 
     uses = list[ServerUse[Server]]()
-    threads = [
-        threading.Thread(target=lambda: uses.append(pool.acquire("slow", start))) for _ in range(3)
-    ]
+    acquire = lambda: uses.append(pool.acquire("slow", start))  # noqa: E731
+    threads = [threading.Thread(target=acquire) for _ in range(3)]
     for thread in threads:
         thread.start()
     assert begun.wait(60)

@@ -238,9 +238,8 @@ def test_a_bundle_says_nothing_in_lines_of_its_own(tmp_path: Path) -> None:
     assert "profile='memory_bytes" in wish
     assert wish.isprintable()
     assert found.label.isprintable()
-    assert "\x1b" not in found.label + "".join(map(str, found.death.values())) + safe_line(
-        found.label
-    )
+    assert "\x1b" not in "".join(map(str, [found.label, *found.death.values()]))
+    assert "\x1b" not in safe_line(found.label)
     with_login = bundle(tmp_path / "b", endpoint="https://me@there:hf_secret@hub.example/x")
     assert all(b"hf_secret" not in file.read_bytes() for file in with_login.iterdir())
     assert load_bundle(with_login).arguments["endpoint"] == "https://hub.example/x"

@@ -53,9 +53,8 @@ def test_what_shards_were_sent_is_kept_as_it_was_asked() -> None:
             m.Reset(5, [3], {"a": 1}, np.array([True])),
         )
     )
-    kept.requested(
-        requested(m.SetAttr(5, "x", tuple(values[:2])), m.SetAttr(5, "x", tuple(values[2:])))
-    )
+    parts = (m.SetAttr(5, "x", tuple(half)) for half in (values[:2], values[2:]))
+    kept.requested(requested(*parts))
     kept.requested(requested(m.Call(5, "f", (1,), {}), m.Call(5, "f", (1,), {})))
     kept.requested(requested(m.CallOne(5, None, 0, "g", (), {}), m.CallOne(5, 1, 0, "g", (), {})))
     values[0][:] = 9.0

@@ -150,11 +150,9 @@ def test_a_repository_within_is_a_pointer(repository: GitRepository, tmp_path: P
 
 def test_conversions_by_git_are_named(repository: GitRepository) -> None:
     """A file whose bytes here are not those of its commit. LFS has the file itself."""
-    attributes = (
-        "*.py ident\n*.txt working-tree-encoding=UTF-16\n*.bin filter=lfs\n*.sh text eol=lf\n"
-    )
+    rules = "*.py ident\n*.txt working-tree-encoding=UTF-16\n*.bin filter=lfs\n*.sh text eol=lf"
     names = ("a.py", "b.txt", "c.bin", "d.sh", "e.md")
-    repository.commit({**dict.fromkeys(names, ""), ".gitattributes": attributes})
+    repository.commit({**dict.fromkeys(names, ""), ".gitattributes": rules})
     here = LocalFolder.at(repository.folder)
     assert list(here.checkout.converted(names)) == [
         ("a.py", "ident=set"),

@@ -135,9 +135,7 @@ def test_a_file_that_costs_too_much_is_not_read(
 
 
 def test_lost_children_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ended = weaker(
-        tmp_path, ("\n        tree = ", "\n        signal.raise_signal(9)\n        tree = ")
-    )
+    ended = weaker(tmp_path, ("  tree = ", "  signal.raise_signal(9)\n        tree = "))
     monkeypatch.setattr(parser, "__file__", ended)
     began: list[object] = []
     run = subprocess.run

@@ -192,9 +192,8 @@ def test_locks_hold_between_processes_on_windows(tmp_path: Path) -> None:
 
 def test_a_child_on_macos_ends_with_its_parent() -> None:
     """By a pipe in place of a pidfd, which a fork of the parent does not keep open."""
-    parent = subprocess.Popen(
-        command("darwin", "-c", _STARTS, _FOLLOWS), stdout=subprocess.PIPE, text=True
-    )
+    words = command("darwin", "-c", _STARTS, _FOLLOWS)
+    parent = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     with parent:
         child, fork = map(int, parent.stdout.readline().split())
         assert psutil.pid_exists(child)

@@ -150,9 +150,8 @@ def test_a_process_that_started_ahead_is_used(folder: Path) -> None:
         cell.start()
         assert cell.run("import sys; result = 'gymnasium' in sys.modules") == {"result": True}
         assert inside.zygote_pid(spawner) == ahead.pid
-        layers = {
-            layer["layer"] for layer in cell.wait_for(RunnerStarted).report if layer["enforced"]
-        }
+        report = cell.wait_for(RunnerStarted).report
+        layers = {layer["layer"] for layer in report if layer["enforced"]}
         assert {"self-test", "seccomp"} <= layers
     assert not os.path.exists(f"/proc/{ahead.pid}")
 

@@ -118,9 +118,8 @@ def test_max_steps_stops_and_says_so() -> None:
     """Unfinished episodes are not counted; every state is observed once."""
     steps: list[int] = []
     given: dict[str, Any] = {"episodes": 1000, "seed": 0, "max_steps": 10}
-    result = rollout(
-        scripted("NextStep", 1), observe=lambda counter: steps.append(counter.steps), **given
-    )
+    observe = lambda counter: steps.append(counter.steps)  # noqa: E731
+    result = rollout(scripted("NextStep", 1), observe=observe, **given)
     assert not result.complete
     assert result.steps <= 10
     assert sum(e.length for e in result.episodes) <= 10

@@ -197,9 +197,7 @@ def test_an_observation_outside_its_space_ends_the_play(
     """A space that is no batch of the single one decides for the whole batch."""
     single = spaces.Box(0, 1, (), np.float32)
     batched = spaces.Box(0, 1, (1, 2), np.float32) if own else batch_space(single, 2)
-    env: Any = SimpleNamespace(
-        num_envs=2, single_observation_space=single, observation_space=batched
-    )
+    env = SimpleNamespace(num_envs=2, single_observation_space=single, observation_space=batched)
     batch = None if values is None else np.array([values] if own else values, np.float32)
     if error is None:
         check_observations(env, "step", batch, final)

@@ -320,9 +320,8 @@ def engine_that_says(
     folder: Path, monkeypatch: pytest.MonkeyPatch, version: str, facts: dict[str, Any]
 ) -> Engine:
     program = folder / "docker"
-    program.write_text(
-        f"#!/bin/sh\n[ $1 = --version ] && echo '{version}' || echo '{json.dumps(facts)}'\n"
-    )
+    answers = f"echo '{version}' || echo '{json.dumps(facts)}'"
+    program.write_text(f"#!/bin/sh\n[ $1 = --version ] && {answers}\n")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", str(folder))
     monkeypatch.delenv("DOCKER_HOST", raising=False)

@@ -26,9 +26,7 @@ from envhub_worker.supervisor import fd_store
 
 COUNT = 2
 BOX = spaces.Box(-1, 1, (3,), np.float32)
-NESTED = spaces.Dict(
-    {"seen": spaces.MultiBinary(4), "both": spaces.Tuple((BOX, spaces.Discrete(9)))}
-)
+NESTED = spaces.Dict(seen=spaces.MultiBinary(4), both=spaces.Tuple((BOX, spaces.Discrete(9))))
 MASK = spaces.Dict({"mask": spaces.Box(0, 1, (4,), np.bool_)})
 
 

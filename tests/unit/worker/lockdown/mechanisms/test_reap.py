@@ -35,9 +35,7 @@ def test_a_child_after_the_last_look_is_killed_too(monkeypatch: pytest.MonkeyPat
             number = next(looks, None)
             if number is not None:
                 time.sleep(number * 0.6)  # as on a machine that is starved
-                return {
-                    above: [pid for pid in below if pid != second] for above, below in seen.items()
-                }
+                return {pid: [one for one in below if one != second] for pid, below in seen.items()}
             return seen
 
         monkeypatch.setattr(procfs, "all_children", late)

@@ -28,9 +28,8 @@ def run(program: Sequence[BpfInstruction], arch: int, number: int, args: Sequenc
 
 
 def _holds(one: BpfInstruction, accumulator: int) -> bool:
-    return {0x15: accumulator == one.k, 0x25: accumulator > one.k, 0x35: accumulator >= one.k}[
-        one.code
-    ]
+    verdicts = {0x15: accumulator == one.k, 0x25: accumulator > one.k, 0x35: accumulator >= one.k}
+    return verdicts[one.code]
 
 
 def listing(program: Sequence[BpfInstruction]) -> str:
