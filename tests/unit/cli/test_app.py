@@ -36,7 +36,7 @@ def commands() -> Iterator[tuple[str, Any]]:
             yield name, command
 
 
-LISTED = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+LISTED = typer.main.get_command(app).commands
 _COMMANDS = dict(commands())
 
 

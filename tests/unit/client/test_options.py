@@ -138,7 +138,7 @@ class _Config:
 def test_properties_of_a_config_cross() -> None:
     """A repository that reads ``cfg.type`` works here as it does in LeRobot."""
     made = plain_config(_Config())
-    names, fields, computed = made.pop(CONFIG_CLASS)  # type: ignore[misc]
+    names, fields, computed = made.pop(CONFIG_CLASS)
     inner: Any = made.pop("inner")
     assert (made, inner["size"]) == ({"hub_path": "org/repo", "task": "push"}, 3)
     assert inner[CONFIG_CLASS][0][0][1] == type(_Config().inner).__qualname__

@@ -62,8 +62,8 @@ def _limit(name: str, value: object, takes: str = "") -> Any:
         *((lambda: Policy(gpu=[True]), "gpu is"), (lambda: Policy(gpu=[-1]), "gpu is")),
         _is("readable", "/data", "; it takes a list"),
         *(_is("environment", value, "; it takes a list of strings") for value in ("HOME", b"HOME")),
-        (lambda: Policy(environment=(1,)), "environment is"),  # type: ignore[arg-type]
-        (lambda: Policy(limits=5), "limits takes a Limits, not int"),  # type: ignore[arg-type]
+        (lambda: Policy(environment=(1,)), "environment is"),
+        (lambda: Policy(limits=5), "limits takes a Limits, not int"),
         (lambda: Policy(readable=("data",)), "'data'; it takes absolute paths"),
         *(_is("output", value) for value in ("", 5, None)),
         *(_is("crash_history", value) for value in (-1, 1.5, True)),
@@ -76,11 +76,11 @@ def _limit(name: str, value: object, takes: str = "") -> Any:
         (lambda: Timeouts(step_s=0), "step_s is 0; it takes seconds above 0, or None"),
         (lambda: Timeouts(step_s=-1.0), "step_s is -1.0"),
         (lambda: Timeouts(step_s=True), "step_s is True"),
-        (lambda: Timeouts(step_s="1"), "step_s is '1'"),  # type: ignore[arg-type]
+        (lambda: Timeouts(step_s="1"), "step_s is '1'"),
         (lambda: Timeouts(step_s=float("nan")), "step_s is nan"),
         (lambda: Timeouts(server_idle_s=-1), "server_idle_s is -1"),
-        (lambda: policy_from("strict", None), "policy takes a Policy or a mapping, not str"),  # type: ignore[arg-type]
-        (lambda: timeouts_from(30), "timeouts takes a Timeouts or a mapping, not int"),  # type: ignore[arg-type]
+        (lambda: policy_from("strict", None), "policy takes a Policy or a mapping, not str"),
+        (lambda: timeouts_from(30), "timeouts takes a Timeouts or a mapping, not int"),
         (
             lambda: policy_from({"limits": {"processes": 5}}, Limits(processes=7)),
             "give one of them",  # an object says all of them: none can be meant to be dropped
@@ -103,9 +103,9 @@ def test_impossible_values_are_refused(make: Any, complaint: str) -> None:
             (Policy(limits=Limits(memory_bytes=value)).limits.memory_bytes, 4_000_000_000)
             for value in (4e9, np.int64(4_000_000_000), np.float32(4e9))
         ),
-        (Policy(readable=["/data"]), Policy(readable=("/data",))),  # type: ignore[arg-type]
-        (Policy(output=Path("a/b.log")).output, "a/b.log"),  # type: ignore[arg-type]
-        (Policy(crash_folder=Path("c")).crash_folder, "c"),  # type: ignore[arg-type]
+        (Policy(readable=["/data"]), Policy(readable=("/data",))),
+        (Policy(output=Path("a/b.log")).output, "a/b.log"),
+        (Policy(crash_folder=Path("c")).crash_folder, "c"),
         (policy_from({"limits": {"memory_bytes": "4G"}}, None).limits.memory_bytes, 4 << 30),
         (policy_from(None, {"disk_bytes": "512 MiB"}).limits.disk_bytes, 512 << 20),
         (

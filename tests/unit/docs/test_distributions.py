@@ -10,7 +10,7 @@ from email.message import Message
 from email.parser import Parser
 from importlib import metadata
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import yaml
@@ -81,7 +81,7 @@ def test_the_version_stands_in_one_place(checkout: Path) -> None:
 
 def test_both_are_fit_for_an_index(plugin: Path, checkout: Path) -> None:
     """The plugin under the name by which LeRobot finds it, with that module, and our version."""
-    assert_fit(cast("Message", metadata.metadata("envhub-sandbox")))
+    assert_fit(metadata.metadata("envhub-sandbox"))
     files = metadata.files("envhub-sandbox") or []
     assert files
     assert [one for one in files if {"tests", "benchmarks", "conftest.py"} & {*one.parts}] == []

@@ -81,7 +81,7 @@ def test_wrong_arguments_are_refused_alike(values: tuple[Any, ...], named: dict[
 def test_fields_by_name_are_not_taken_in_order() -> None:
     assert Named(only=1).only == 1
     with pytest.raises(TypeError, match="Named takes only"):
-        Named(1)  # type: ignore[misc]
+        Named(1)
 
 
 def test_records_do_not_change() -> None:

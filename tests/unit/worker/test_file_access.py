@@ -52,7 +52,7 @@ def look(packages: Path, path: Path, *names: str) -> dict[str, str | None]:
     """Import these as a plain user, and what is said of the ones that are not found."""
     command = [sys.executable, "-I", "-S", "-c", _LOOK, packages, path, *names]
     user = {"user": 12345, "group": 12345, "extra_groups": []} if os.getuid() == 0 else {}
-    done = subprocess.run(command, capture_output=True, check=True, cwd="/", **user)  # type: ignore[call-overload]
+    done = subprocess.run(command, capture_output=True, check=True, cwd="/", **user)
     return dict(json.loads(done.stdout))
 
 

@@ -423,5 +423,5 @@ def test_odd_encodings_are_told(case: str, tmp_path: Path, monkeypatch: pytest.M
 )
 def test_what_is_utf_8_is_read(source: bytes) -> None:
     """However it says so, wherever its lines end, and by the names that Python makes of letters."""
-    [one] = parsing.parsed({"odd.py": source})["odd.py"].imports  # type: ignore[union-attr]
+    [one] = parsing.parsed({"odd.py": source})["odd.py"].imports
     assert one.names == ["os"]

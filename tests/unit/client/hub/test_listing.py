@@ -21,9 +21,9 @@ def record(path: str, size: int = 1) -> listing.FileRecord:
 @pytest.mark.parametrize("value", [0, -1, True, 1.5, "9", None])
 def test_limit_must_be_a_positive_int(value: object) -> None:
     with pytest.raises(PolicyError, match="max_files"):
-        listing.SnapshotLimits(max_files=value)  # type: ignore[arg-type]
+        listing.SnapshotLimits(max_files=value)
     with pytest.raises(TypeError, match="max_size"):
-        listing.SnapshotLimits(max_size=1)  # type: ignore[call-arg]
+        listing.SnapshotLimits(max_size=1)
 
 
 def test_listing_exactly_at_the_limits_passes_sorted() -> None:
@@ -41,7 +41,7 @@ def test_limit_stops_reading_the_listing() -> None:
             yield record(str(len(read)))
 
     with pytest.raises(SnapshotTooLargeError, match=r"SnapshotLimits\(max_files=\.\.\.\)"):
-        listing.listing_within_limits(endless(), listing.SnapshotLimits(max_files=3), "t")  # type: ignore[arg-type]
+        listing.listing_within_limits(endless(), listing.SnapshotLimits(max_files=3), "t")
     assert len(read) == 4
 
 

@@ -197,7 +197,7 @@ def test_token_in_a_url_is_not_repeated(text: str) -> None:
 def test_something_else_than_text_is_refused() -> None:
     """A path object or None gets the grammar, not an AttributeError; LeRobot's is a ValueError."""
     with pytest.raises(HubReferenceError, match="owner/name@revision"):
-        HubRef.parse(None)  # type: ignore[arg-type]
+        HubRef.parse(None)
     assert issubclass(HubReferenceError, ValueError)
 
 

@@ -192,7 +192,7 @@ class _Maker(Sandbox):
 
 def _request(*, always: bool = False) -> PackageRequest:
     request: Any = type("Request", (), {"always": always})()
-    return request  # type: ignore[no-any-return]
+    return request
 
 
 def _packages(*places: _Maker) -> tuple[FleetPackages, list[Member]]:

@@ -362,7 +362,7 @@ def test_an_interrupted_end_is_finished_by_the_next_leave(
 
     assert hold.close_later(server, interrupted)
     further()
-    server.stop = interrupted  # type: ignore[method-assign]
+    server.stop = interrupted
     with pytest.raises(KeyboardInterrupt):
         leave()
     del server.stop

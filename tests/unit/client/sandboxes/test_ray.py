@@ -96,7 +96,7 @@ class Ray:
 
 
 def use(ray: Ray, monkeypatch: pytest.MonkeyPatch) -> Ray:
-    monkeypatch.setitem(sys.modules, "ray", ray)  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "ray", ray)
     monkeypatch.setattr(cluster, "check_installed", lambda: None)
     return ray
 

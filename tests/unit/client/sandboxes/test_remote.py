@@ -215,7 +215,7 @@ def packages(state: str, name: str = "", progress: str = "", **facts: object) ->
 def make(server: LyingServer, lines: list[str]) -> tuple[PackageSet | None, ServerPackages]:
     """What the server makes; its use is released, whatever it says."""
     use = LyingUse(server)
-    target = ServerPackages(lambda: use, {})  # type: ignore[arg-type,return-value]
+    target = ServerPackages(lambda: use, {})
     try:
         return target.make(REQUEST, lines.append), target
     finally:

@@ -70,7 +70,7 @@ def test_a_bundle_comes_back(tmp_path: Path) -> None:
     assert found.reference == f"models/org/repo@{COMMIT}"
     assert found.steps == 3
     assert [type(one).__name__ for one in found.requests()] == ["Reset", "Step", "Step", "Step"]
-    assert found.load.env_kwargs["size"].tolist() == [0, 1, 2]  # type: ignore[attr-defined]
+    assert found.load.env_kwargs["size"].tolist() == [0, 1, 2]
     arguments = replayed_arguments(found)
     assert arguments["policy"] == {"crash_history": 0, "lane": "frames"}
     assert arguments["num_workers"] == 1

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
@@ -77,7 +77,7 @@ def place() -> _Place:
 def launcher(client: _Client, place: _Place) -> Launcher:
     repository = session_over(FakeLane()).repository
     repository.policy = type(repository.policy)(record_denials=True)
-    repository.runtime = cast("Any", SimpleNamespace(python="", packages=""))
+    repository.runtime = SimpleNamespace(python="", packages="")
     repository.places = []
     return Launcher(repository, place, Path())
 
@@ -93,7 +93,7 @@ def opened(launcher: Launcher, client: _Client, place: _Place) -> Any:
         drop=lambda: None,
     )
     use = place.acquire(None)
-    return LoadedJail(cast("Any", jail), cast("Any", None), {}, set(), use, launcher.close)
+    return LoadedJail(jail, None, {}, set(), use, launcher.close)
 
 
 def test_a_jail_is_closed_once(launcher: Launcher, client: _Client, place: _Place) -> None:
@@ -148,7 +148,7 @@ def test_denials_are_asked_for_where_the_server_can_know(
     error = WorkerDiedError("it died", reason=reason)
     for _ in range(2):
         launcher.note_denied(error, _SERVER, 7)
-    launcher.note_denied(KeyboardInterrupt(), cast("Any", None), 7)
+    launcher.note_denied(KeyboardInterrupt(), None, 7)
     assert len(client.asked) == asked
     assert error.denied == (("ptrace",) if asked else None)
 

@@ -3,14 +3,14 @@
 import threading
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
 from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
 from envhub_sandbox.session import lease as lease_module
 from envhub_sandbox.session.lease import Lease
-from envhub_sandbox.session.prewarm import Prewarm, SuitePrewarm
+from envhub_sandbox.session.prewarm import SuitePrewarm
 from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from tests.support.in_process.fake_lane import FakeLane, session_over
@@ -55,13 +55,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> tuple[Lease, _Jails]:
     building = SimpleNamespace(build=lambda *_: jails.do("build") or lane)
     monkeypatch.setattr(lease_module, "Builder", lambda *_: building)
     session.lifecycle.state = State.IDLE
-    lease = Lease(
-        cast("Any", jails),
-        session.requests.results,
-        session.lifecycle,
-        session.counters,
-        cast("Any", None),
-    )
+    lease = Lease(jails, session.requests.results, session.lifecycle, session.counters, None)
     return lease, jails
 
 
@@ -183,7 +177,7 @@ class _Task:
 
 def suite_of(count: int, ahead: int | None = 1) -> list[_Task]:
     tasks = [_Task() for _ in range(count)]
-    SuitePrewarm([[[cast("Prewarm", task)] for task in tasks]], ahead)
+    SuitePrewarm([[[task] for task in tasks]], ahead)
     return tasks
 
 

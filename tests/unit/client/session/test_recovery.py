@@ -1,6 +1,6 @@
 """What is made of deaths: who the server says has died, seeds for the fresh, rows of the dead."""
 
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +8,6 @@ from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.session.recovery import SeedBook, derived_seed, resets, revived_step
-from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.replies import RunnersDiedError
@@ -42,7 +41,7 @@ class Told:
 
 
 def jail(reply: m.Message, *parts: m.Message, kept: bool = True) -> JailHandle:
-    client = cast("WorkerConnection", Told(reply, *parts))
+    client = Told(reply, *parts)
     made = JailHandle(client, 1, [1, 2], [], DEFAULT_LIMITS)
     made.kept = kept
     return made
@@ -128,16 +127,16 @@ def test_resets_of_the_fresh_are_those_of_the_dead() -> None:
     mask = np.array([True, False])
     first, second = resets(m.Reset(1, None, {"a": 1}, mask), [8, 9])
     assert first == m.Reset(1, [8, 9], None, None)
-    assert cast("m.Reset", second).mask is mask
+    assert second.mask is mask
 
 
 def test_rows_of_the_dead_are_truncated_whatever_the_fresh_say() -> None:
     yes = np.ones(2, np.bool_)
     said = m.StepDone(np.zeros((2, 1)), np.full((2, 3), 9.0), yes, ~yes, {"worker_restarted": ~yes})
     row = revived_step(said, 2)
-    assert row.rewards.tolist() == [[0.0] * 3] * 2  # type: ignore[attr-defined]
-    assert (row.terminations.tolist(), row.truncations.tolist()) == ([False] * 2, [True] * 2)  # type: ignore[attr-defined]
-    assert row.info["worker_restarted"].tolist() == [True, True]  # type: ignore[attr-defined]
+    assert row.rewards.tolist() == [[0.0] * 3] * 2
+    assert (row.terminations.tolist(), row.truncations.tolist()) == ([False] * 2, [True] * 2)
+    assert row.info["worker_restarted"].tolist() == [True, True]
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (2, 2**31 - 1)])
@@ -149,7 +148,7 @@ def test_a_shape_that_is_only_told_is_not_taken_for_rewards(shape: tuple[int, ..
     said = m.unpack(frames, things=DescriptionReader)
     assert isinstance(said, m.StepDone)
     assert getattr(said.rewards, "shape", None) == shape
-    assert revived_step(said, 2).rewards.shape == (2,)  # type: ignore[attr-defined]
+    assert revived_step(said, 2).rewards.shape == (2,)
     for shardable in (True, False):
         space = spaces.Box(-1, 1, (1,), np.float64)
         found = Results(env_manifest(single_observation_space=space, shardable=shardable), [(0, 2)])

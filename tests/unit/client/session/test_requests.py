@@ -52,10 +52,10 @@ def test_what_is_sent_instead_is_not_what_is_kept(session: EnvSession, lane: Fak
     def unsendable(request: object) -> None:
         raise errors.LocalProtocolError("too large")
 
-    send, lane.send = lane.send, unsendable  # type: ignore[method-assign]
+    send, lane.send = lane.send, unsendable
     with pytest.raises(errors.LocalProtocolError):
         session.requests.submit("render", render)
-    lane.send = send  # type: ignore[method-assign]
+    lane.send = send
     assert session.counters.requests == 0
     session.requests.submit("call", render, lambda number, _: m.Watch(number, "name"))
     assert lane.sent == [m.Watch(lane.number, "name")]
@@ -106,7 +106,7 @@ def test_a_close_by_a_signal_in_a_wait_says_closed(session: EnvSession, lane: Fa
         session.close()
         raise OSError("the socket is gone")
 
-    lane.replies = closing  # type: ignore[method-assign]
+    lane.replies = closing
     with pytest.raises(ClosedEnvironmentError):
         session.requests.ask("render", render)
     assert lane.closed

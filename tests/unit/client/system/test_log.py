@@ -44,4 +44,4 @@ def test_terminals_alone_get_it(variables: dict[str, str], monkeypatch: pytest.M
     monkeypatch.setattr(sys, "stderr", Terminal())
     with log.progress_shown("org/repo") as tell:
         tell("resolving")
-    assert sys.stderr.getvalue() == ""  # type: ignore[attr-defined]
+    assert sys.stderr.getvalue() == ""

@@ -3,7 +3,6 @@
 import threading
 import time
 from collections.abc import Iterator
-from typing import Any, cast
 from unittest.mock import Mock
 
 import pytest
@@ -42,7 +41,7 @@ def test_what_can_change_without_a_word_is_not_kept() -> None:
 def test_what_has_arrived_is_shown_and_stays() -> None:
     """As the frames of each runner; nothing of a reply that is refused when it is taken."""
     server = FakeServer()
-    jail = JailHandle(cast("Any", server), 1, [1, 2], [], DEFAULT_LIMITS)
+    jail = JailHandle(server, 1, [1, 2], [], DEFAULT_LIMITS)
     wrong: list[m.Message] = [
         m.RelayDone((1,)),
         m.RelayDone((3,)),
@@ -71,7 +70,7 @@ def test_what_has_arrived_is_shown_and_stays() -> None:
 def test_what_the_next_request_makes_useless_is_not_kept() -> None:
     """A runner that can have infos asked for, and then not taken, fills no memory with them."""
     server = FakeServer()
-    jail = JailHandle(cast("Any", server), 1, [1], [], DEFAULT_LIMITS)
+    jail = JailHandle(server, 1, [1], [], DEFAULT_LIMITS)
     results = Mock(slices=[(0, 1)])
     lane = Lane(jail, [1], 7, results)
     for _ in range(100):
@@ -101,7 +100,7 @@ def lanes() -> Iterator[list[FakeLane]]:
 
 
 def found(lanes: list[FakeLane], timeout_s: float | None) -> list[int]:
-    return answered_first(cast("list[Any]", lanes), Deadline(timeout_s))
+    return answered_first(lanes, Deadline(timeout_s))
 
 
 def test_who_has_answered_is_found_at_once(lanes: list[FakeLane]) -> None:

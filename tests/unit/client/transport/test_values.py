@@ -180,4 +180,4 @@ def test_broken_torch_is_no_workers_fault(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(DependencyError, match=r"torch is installed here.*another numpy"):
         values.unpacked(frames)
     monkeypatch.undo()
-    assert values.unpacked(frames).value.tolist() == [0, 0]  # type: ignore[attr-defined]
+    assert values.unpacked(frames).value.tolist() == [0, 0]

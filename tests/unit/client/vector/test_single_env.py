@@ -89,9 +89,9 @@ def test_its_sandbox_is_never_the_environments_own_word() -> None:
     vector = SyncVectorEnv([_Boasting])
     with pytest.raises(AttributeError, match="sandbox"):
         _ = SingleEnv(vector).sandbox
-    vector.sandbox = "the best"  # type: ignore[attr-defined]
+    vector.sandbox = "the best"
     assert not hasattr(SingleEnv(vector), "sandbox")
-    vector.sandbox = view = SandboxView(None)  # type: ignore[arg-type, attr-defined]
+    vector.sandbox = view = SandboxView(None)
     assert SingleEnv(vector).sandbox is gym.Wrapper(SingleEnv(vector)).unwrapped.sandbox is view
 
 

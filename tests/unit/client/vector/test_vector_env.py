@@ -43,7 +43,7 @@ def test_interrupts_leave_no_endless_wait(module: ModuleType, act: Callable[[Any
     line = 0
     while True:
         env = SandboxVectorEnv(session_over(FakeLane()))
-        came = before_line(module.__file__, line, lambda env=env: act(env))  # type: ignore[misc]
+        came = before_line(module.__file__, line, lambda env=env: act(env))
         observations, infos = env.reset()
         assert (observations.shape[0], infos) == (env.num_envs, {})
         env.close()

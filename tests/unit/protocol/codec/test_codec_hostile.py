@@ -155,7 +155,7 @@ def test_what_is_looked_at_is_never_borrowed() -> None:
             return lambda code, value: noted.append(value)
 
         decoder = Decoder(tail, buffers, DEFAULT_LIMITS, None, None, things, borrows=borrows)
-        array, flags, _ = decoder.value(document)  # type: ignore[misc]
+        array, flags, _ = decoder.value(document)
         looked_at = [flags, described[0]["keys"][0]]
         assert [any(map(partial(np.shares_memory, one), lies)) for one in looked_at] == [False] * 2
         assert any(map(partial(np.shares_memory, array), lies)) is borrows

@@ -4,7 +4,7 @@ arrives as a description, and the rest as it is."""
 import functools
 import threading
 import types
-from typing import Any, cast
+from typing import Any
 
 import cloudpickle
 import numpy as np
@@ -192,7 +192,7 @@ def test_of_a_reply_that_cannot_be_sent_the_rest_arrives(name: str) -> None:
     with pytest.raises(LocalProtocolError):
         encode(message, limits=_LIMITS)
     frames = encode(message, reduces=True, limits=_LIMITS)
-    found = cast("list[Any]", decode(frames, limits=_LIMITS))
+    found = decode(frames, limits=_LIMITS)
     assert (found[0], found[1].tolist()) == (71, [0, 1, 2])
     assert (list(found[2]), found[2]["z"]) == (["a", "part", "z"], {"x": [2, "text"]})
     assert _holds_one(found[2]["part"])
@@ -218,6 +218,6 @@ class _Untold:
 
 
 def test_a_part_whose_error_has_no_text_does_not_lose_the_rest() -> None:
-    found = cast("list[Any]", decode(encode([71, {"part": _Untold(), "z": 1}], reduces=True)))
+    found = decode(encode([71, {"part": _Untold(), "z": 1}], reduces=True))
     assert type(found[1].pop("part")) is RemoteObject
     assert found[1] == {"z": 1}

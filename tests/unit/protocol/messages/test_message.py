@@ -90,7 +90,7 @@ def test_a_form_that_cannot_be_made_is_none(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_what_can_be_changed_of_a_recurring_message_is_the_receivers_own() -> None:
     frames = m.pack(m.Value({"a": [1]}))
-    values = [m.unpack(frames).value for _ in range(4)]  # type: ignore[attr-defined]
+    values = [m.unpack(frames).value for _ in range(4)]
     for number, value in enumerate(values):
         value["a"][:] = [number]
         value["more"] = number
@@ -142,16 +142,16 @@ def test_pickled_objects_and_tensors_never_have_a_form() -> None:
     frames = m.pack(m.Value(_Own()), pickler=cloudpickle.dumps)
     for _ in range(3):
         message = m.unpack(frames, unpickler=cloudpickle.loads)
-        assert type(message.value).__name__ == "_Own"  # type: ignore[attr-defined]
+        assert type(message.value).__name__ == "_Own"
     for _ in range(3):
         with pytest.raises(errors.ProtocolError):
             m.unpack(frames)
     torch = pytest.importorskip("torch")
     frames = m.pack(m.Value(torch.zeros(2)))
     for _ in range(3):
-        assert type(m.unpack(frames).value) is np.ndarray  # type: ignore[attr-defined]
+        assert type(m.unpack(frames).value) is np.ndarray
     made = m.unpack(frames, tensors=lambda array, name: (name, array))
-    assert made.value[0] == "float32"  # type: ignore[attr-defined]
+    assert made.value[0] == "float32"
 
 
 class _Own:

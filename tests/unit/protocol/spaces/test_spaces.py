@@ -379,7 +379,7 @@ def test_boxes_that_are_alike_share_their_bounds_and_nothing_else() -> None:
     reader = SpaceReader(10_000 + 2 * SPACE_BYTES)
     boxes = [reader.space(decode(encode(value))) for _ in range(20)]
     assert all(box == boxes[0] for box in boxes)
-    assert all(np.shares_memory(box.low, boxes[0].low) for box in boxes)  # type: ignore[attr-defined]
+    assert all(np.shares_memory(box.low, boxes[0].low) for box in boxes)
     boxes[0].seed(0)
     boxes[1].seed(1)
     assert boxes[0].np_random is not boxes[1].np_random

@@ -97,7 +97,7 @@ class Between(Env):
 class Deaf(Bare):
     """Somebody's, whose ``seed`` takes nothing."""
 
-    def seed(self) -> None:  # type: ignore[override]
+    def seed(self) -> None:
         raise AssertionError
 
 
@@ -117,7 +117,7 @@ class Last(Env):
 class Blind(Wrapper):
     """A wrapper of somebody's that passes nothing on."""
 
-    def reset(self) -> Any:  # type: ignore[override]
+    def reset(self) -> Any:
         return self.env.reset()
 
 
@@ -178,10 +178,10 @@ def test_a_space_without_a_counterpart_is_named() -> None:
 
 def test_an_attribute_is_set_where_it_is() -> None:
     env = Bare()
-    env.gain = 1  # type: ignore[attr-defined]
+    env.gain = 1
     adapted = old_gym.OldEnv(Wrapper(env))
     adapted.gain = 2
-    assert env.gain == adapted.gain == 2  # type: ignore[attr-defined]
+    assert env.gain == adapted.gain == 2
     assert "gain" not in vars(adapted)
 
 

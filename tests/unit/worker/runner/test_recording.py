@@ -72,7 +72,7 @@ def test_a_copy_stands_in_too(kind: str, tmp_path: Path) -> None:
     env = stand_in(kind, maker)
     with standing_in():
         again = copy.deepcopy(env)
-    assert len(recording(again).env_fns) == 2  # type: ignore[union-attr]
+    assert len(recording(again).env_fns) == 2
     assert maker.built == 0
 
 

@@ -57,7 +57,7 @@ def test_who_waits_for_a_jail_that_another_closes_hears_of_it(stepped: bool) -> 
     """A thread that waits for a step, which the server takes or the runner's stream does."""
     jail = MagicMock()
     ours, theirs = socket.socketpair()
-    pending: Any = Pending("who steps", "step", [None])  # type: ignore[arg-type]
+    pending: Any = Pending("who steps", "step", [None])
     with theirs, told_of(jail) as (events, entry, _, said):
         link = entry.links[1] = RunnerLink(ours, DEFAULT_LIMITS)
         if stepped:
@@ -66,7 +66,7 @@ def test_who_waits_for_a_jail_that_another_closes_hears_of_it(stepped: bool) -> 
             events.step(entry, link, bytes((words.DTYPES - words.SPIN) * 8), (pending, 0))
         else:
             link.pending[1] = pending, 0
-        entry.closing.append("who closes")  # type: ignore[arg-type]
+        entry.closing.append("who closes")
         events.jail_gone(JailExited(jail, 0, None))
         assert [asker for asker, _ in said] == ["who steps", "who closes"]
         death = said[0][1]

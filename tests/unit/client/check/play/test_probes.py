@@ -75,7 +75,7 @@ def test_frames_fit_their_mode(mode: str, rendered: Any, said: str) -> None:
 def test_modes_that_need_no_window_are_tried(declared: Any) -> None:
     env: Any = SimpleNamespace(metadata={"render_modes": declared}, render_mode="rgb_array")
     assert other_modes(env) == ["ansi"]
-    assert other_modes(SimpleNamespace(metadata={"render_modes": 3}, render_mode=None)) == []  # type: ignore[arg-type]
+    assert other_modes(SimpleNamespace(metadata={"render_modes": 3}, render_mode=None)) == []
 
 
 PLAYABLE = spaces.Dict({"agent_pos": spaces.Box(-1, 1, (2,), np.float32)})

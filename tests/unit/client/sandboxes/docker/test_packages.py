@@ -49,7 +49,7 @@ def test_what_it_imports_is_in_the_image_or_made(monkeypatch: pytest.MonkeyPatch
     """By the names of distributions: nothing of an image is imported to see."""
     monkeypatch.setattr(packages, "find_image", lambda engine, image: image)
     monkeypatch.setattr(packages, "image_packages", lambda engine, image: (NEWER, THERE))
-    target = packages.ImageTarget(lambda: None, "image")  # type: ignore[arg-type, return-value]
+    target = packages.ImageTarget(lambda: None, "image")
     for brought_by, met in ((("absent", "wanted-one"), True), (("absent",), False)):
         guess = Guess("module", parse_requirement("absent", "env.py, line 1"), brought_by)
         assert target.meets(replace(declares(), guesses=(guess,))) == met

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -229,7 +229,7 @@ def test_an_order_names_assets_as_they_lie_inside(sandbox: Callable[..., Any]) -
     own, *others = (("models--org--r", "", ""), ("datasets--a--b", "/c/b", "asset-1"))
     copies = tuple((name, "a" * 40, ("main",), tree) for name, tree, _ in (own, *others))
     order = m.OpenJail("x", "", "", "/c/own", "env.py", {}, 1, hub_copies=copies)
-    server = cast("Any", SimpleNamespace(python="", profile="strict"))
-    made = place.prepare(order, server, cast("Any", None), Deadline(1))
+    server = SimpleNamespace(python="", profile="strict")
+    made = place.prepare(order, server, None, Deadline(1))
     assert made.snapshot == "/snapshots/this"
     assert [copy.tree for copy in made.repositories] == ["", "/snapshots/asset-1"]

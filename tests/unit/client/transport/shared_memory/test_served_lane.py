@@ -3,7 +3,7 @@
 import mmap
 import os
 import struct
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -144,7 +144,7 @@ class Served:
     def __init__(self, shards: int = 1) -> None:
         self.server = FakeServer()
         runners, bounds = range(1, shards + 1), [(at, at + 1) for at in range(shards)]
-        jail = JailHandle(cast("Any", self.server), 1, runners, [], DEFAULT_LIMITS)
+        jail = JailHandle(self.server, 1, runners, [], DEFAULT_LIMITS)
         manifest = env_manifest(
             single_observation_space=SMALL, single_action_space=spaces.Discrete(99), num_envs=shards
         )
@@ -280,7 +280,7 @@ def _answering(server: FakeServer, frames: Frames) -> list[Any]:
         server.answer(frames)
         return request_id
 
-    server.send = sent  # type: ignore[method-assign]
+    server.send = sent
     return server.sent
 
 

@@ -90,5 +90,5 @@ def test_comparisons_find_their_label(targets: list[int], padding: int, number: 
     items.append(Do(RETURN, 999))
     for label in range(41):
         items += [Label(f"l{label}"), Do(RETURN, label), *[Do(LOAD, 0)] * padding]
-    program = assemble(items)  # type: ignore[arg-type]
+    program = assemble(items)
     assert run(program, 0, number) == (targets[number] if number < len(targets) else 999)
