@@ -1,1 +1,1 @@
-"""What confines a jail: the plan (pure), its stages and mechanisms, the report, and the probe."""
+"""The confinement of a jail: the plan (pure), its stages and mechanisms, the report, the probe."""

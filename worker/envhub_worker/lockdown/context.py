@@ -1,4 +1,4 @@
-"""What the stages of lockdown hand down: zygote to init, init to runner."""
+"""Data that one stage of lockdown hands to the next: zygote to init, init to runner."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from envhub_worker.protocol.records import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class ZygoteConfig:
-    """How a zygote is started.
+    """The configuration of a zygote.
 
     Attributes:
         parent: The server's pid.
-        target: What a runner runs once it is confined, as ``"module:function"``.
-        gpu: Whether they get all GPUs, or the indices of those that they get.
-        packages: The folder of packages that their code comes with, symbolic links resolved, or
-            empty. Not trusted: only a runner imports from it, once it is confined.
+        target: The function that a confined runner calls, as ``"module:function"``.
+        gpu: Whether the jails get all GPUs, or the indices of their GPUs.
+        packages: The folder of the jails' packages, symbolic links resolved, or empty. Not trusted:
+            only a confined runner imports from it.
         place: An empty folder of the zygote's own.
         canary: A file that exists and that no jail may read.
-        user: The user to become where the server is root, else None.
-        record: Whether init answers what the filter denies, and tells.
-        refusal: Why no jail can be had (``LayerUnavailableError.to_wire``), if that is known.
+        user: The user to become if the server is root, else None.
+        record: Whether init answers denied system calls and reports them.
+        refusal: Why jails are impossible here (``LayerUnavailableError.to_wire``), if known.
     """
 
     parent: int
@@ -45,25 +45,25 @@ class ZygoteConfig:
 
     @classmethod
     def from_wire(cls, data: dict[str, Any]) -> ZygoteConfig:
-        """From ``dataclasses.asdict`` after a trip through JSON."""
+        """Rebuilds a configuration from its ``dataclasses.asdict`` form after JSON."""
         lists = {name: tuple(value) for name, value in data.items() if type(value) is list}
         return cls(**{**data, **lists})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Common:
-    """What a zygote hands to each of its inits.
+    """Data that a zygote hands to each of its inits.
 
     Attributes:
-        pid: The zygote's pid as an init sees it as its parent.
-        root: What a jail sees of the host's files, symbolic links resolved.
+        pid: The zygote's pid, as an init sees its parent.
+        root: The host's files that a jail sees, symbolic links resolved.
         covered: (files, folders) of /proc to hide.
-        landlock_abi: 0 where there is none.
+        landlock_abi: The kernel's Landlock ABI; 0 without Landlock.
         brokered: Whether init sends the jails' signals.
-        watched: Permitted calls that init is notified of, so that it can record them.
+        watched: Permitted calls that the kernel reports to init, so that init can record them.
         programs: The compiled system call filters: one for jails whose memory a control group
             counts, one for jails whose init measures it.
-        set_blas_threads: Sets OpenBLAS's threads, if that is what numpy uses.
+        set_blas_threads: Sets the number of OpenBLAS's threads, if numpy uses OpenBLAS.
     """
 
     config: ZygoteConfig
@@ -80,12 +80,12 @@ class Common:
 
 @dataclass(frozen=True, kw_only=True)
 class JailContext:
-    """What init knows and its runners need.
+    """Data of an init that its runners need.
 
     Attributes:
         processes: Cap for ``RLIMIT_NPROC``.
-        measured: Init measures memory, because no control group counts it.
-        joins: Descriptors to write to in order to join the jail's control group, if it has one.
+        measured: Whether init measures memory because no control group counts it.
+        joins: Descriptors of the files that a runner writes to join the jail's control group.
     """
 
     init: int
@@ -103,8 +103,8 @@ class OwnPaths:
     """The paths that a jail's processes may use.
 
     Attributes:
-        changed: Folders and files that they may change.
-        read: Those that they may read.
+        changed: Folders and files that the processes may change.
+        read: Folders and files that they may read.
         scratch: Folders in which they may have created symbolic links.
     """
 

@@ -1,8 +1,8 @@
-"""Which GPUs a host has, and what of them a jail is given: device nodes and folders of /sys. Pure.
+"""The GPUs of a host, and the device nodes and folders of /sys that a jail gets for them. Pure.
 
-The nodes are those that compute and render: ``nvidiaN``, ``renderD*``, and ``nvidiactl``,
+A jail gets the nodes for computing and rendering: ``nvidiaN``, ``renderD*``, and ``nvidiactl``,
 ``nvidia-uvm`` and ``kfd``, through which a driver reaches every GPU whose own node can be opened.
-No display (``card*``, ``nvidia-modeset``), no profiler (``nvidia-uvm-tools``).
+It gets no display (``card*``, ``nvidia-modeset``) and no profiler (``nvidia-uvm-tools``).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _KFD, _KFD_FOLDER = "/dev/kfd", "/sys/class/kfd/kfd"
 
 @dataclass(frozen=True)
 class GpuGrant:
-    """What a jail gets. ``folders``: paths of /sys; links among them are followed."""
+    """Device nodes and folders for a jail. ``folders``: paths of /sys; their links are followed."""
 
     devices: tuple[str, ...] = ()
     folders: tuple[str, ...] = ()
@@ -38,9 +38,9 @@ def gpu_devices(host: HostFiles) -> tuple[str, ...]:
 
 
 def granted(gpu: bool | tuple[int, ...], host: HostFiles) -> GpuGrant:
-    """What ``gpu`` grants on this host: nothing, all GPUs, or those of some indices.
-    Raises ``LayerUnavailableError``: there is no such GPU. It would be missed later, and only by
-    some.
+    """Returns the grant for ``gpu`` on this host: no GPU, all GPUs, or those of some indices.
+    Raises ``LayerUnavailableError``: there is no such GPU. Without this error a program would only
+    fail later, or fall back to the CPU.
     """
     if gpu is False:
         return GpuGrant()
@@ -66,7 +66,7 @@ def granted(gpu: bool | tuple[int, ...], host: HostFiles) -> GpuGrant:
 
 
 def gpus(host: HostFiles) -> list[tuple[str, ...]]:
-    """The nodes of each GPU: NVIDIA's first, by PCI address, which is how ``nvidia-smi`` counts."""
+    """The nodes of each GPU: NVIDIA's first, in the order of ``nvidia-smi``, by PCI address."""
     by_device: dict[str, list[str]] = {}
     for node in _own_nodes(host):
         by_device.setdefault(_address(node, host) or node, []).append(node)

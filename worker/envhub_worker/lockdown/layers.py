@@ -1,4 +1,4 @@
-"""How lockdown speaks of its layers: what holds, and what this host cannot give."""
+"""Records about layers of the lockdown: enforced ones, and those that this host lacks."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Layer:
 
 
 class LayerUnavailableError(Exception):
-    """A layer that the profile names cannot be had on this host. Nothing may run.
-    ``fix``: what the user can do, by exact command where there is one.
+    """This host lacks a layer that the profile requires, so nothing may run.
+    ``fix``: what the user can do, with the exact command if there is one.
     """
 
     def __init__(self, layer: str, reason: str, fix: str) -> None:
@@ -38,7 +38,7 @@ class LayerUnavailableError(Exception):
 
 
 def no_system_calls(machine: str) -> LayerUnavailableError:
-    """There is no table of system calls for ``machine``."""
+    """Returns the error that there is no table of system calls for ``machine``."""
     return LayerUnavailableError(
         "seccomp",
         f"no system call table for {machine}",

@@ -1,7 +1,7 @@
-"""From what is permitted and what the host has to an ordered list of layers. Pure.
+"""Makes an ordered list of layers from a policy and the host's abilities. Pure.
 
-A layer that the profile names and the host lacks raises: nothing degrades silently. Layers that
-a weaker profile goes without are listed too, with what stays possible.
+A layer that the profile requires and the host lacks raises an error: nothing degrades silently. The
+list includes the layers that a weaker profile omits, with the attacks that stay possible.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ SHARED_QUOTAS = "pages of pipes, descriptors in flight in sockets, epoll watches
 
 
 def needs_broker(*, namespaced: bool, landlock_abi: int) -> bool:
-    """Whether nothing but init keeps a jail's signals inside: no pid namespace and no Landlock."""
+    """Whether only init can keep a jail's signals inside: no pid namespace, no Landlock scope."""
     return not namespaced and not scopes(landlock_abi)
 
 
 def plan(
     confinement: Confinement, *, machine: str, root: bool, landlock_abi: int, memory: str
 ) -> tuple[Layer, ...]:
-    """The layers for ``confinement`` on a host like this, in their order.
-    Raises ``LayerUnavailableError``: the profile names a layer that the host lacks.
+    """Returns the layers for ``confinement`` on a host with these abilities, in order.
+    Raises ``LayerUnavailableError``: the profile requires a layer that the host lacks.
 
     Args:
-        landlock_abi: 0 where there is none.
-        memory: What caps memory: ``"cgroup-v2"``, ``"cgroup-v1"`` or ``"watchdog"``.
+        landlock_abi: The kernel's Landlock ABI; 0 without Landlock.
+        memory: The mechanism that limits memory: ``"cgroup-v2"``, ``"cgroup-v1"``, ``"watchdog"``.
     """
     _check(confinement, machine, landlock_abi)
     limits, namespaced = confinement.limits, confinement.profile == "strict"
@@ -54,7 +54,9 @@ def plan(
 
 
 def _check(confinement: Confinement, machine: str, landlock_abi: int) -> None:
-    """Raise ``LayerUnavailableError`` for a profile that cannot be had, or not with its options."""
+    """Raise ``LayerUnavailableError`` for a profile that this host cannot enforce, or not with
+    these options.
+    """
     for name, value, permitted in (
         ("profile", confinement.profile, PROFILES),
         ("network", confinement.network, NETWORKS),
@@ -126,7 +128,7 @@ def _landlock_layer(abi: int) -> Layer:
 
 
 def _uncounted(confinement: Confinement, memory: str, namespaced: bool) -> str:
-    """Kinds of a jail's memory that nothing counts here, for the report."""
+    """Returns the kinds of a jail's memory that nothing counts here, for the report."""
     names = ["file locks"]
     if confinement.gpu is not False:
         names.append("memory of the GPU's driver")
@@ -151,7 +153,7 @@ def _limit_layers(
         "cgroup-v1": f"{amount}, counted by the kernel (cgroup v1)",
         "watchdog": f"{amount}, measured by the jail's init; bursts between two looks overshoot",
     }
-    # what the kernel counts per user, and a jail therefore takes from others' share
+    # The kernel counts these per user, so a jail takes them from the user's other programs.
     shared = f"shared with this user's programs: {SHARED_QUOTAS}"
     alone = "jails of root, or of a user who runs nothing else, have their own"
     quotas = Layer("user-quotas", False, f"{shared}; {alone}")

@@ -1,17 +1,16 @@
-"""What this host can enforce, found out by doing it in throwaway processes.
+"""Finds out what this host can enforce by trying it in throwaway processes.
 
 ``python -I bootstrap.py probe`` prints one JSON object for ``envhub doctor``::
 
     {"host": {...}, "layers": [{"layer", "available", "detail", "fix"}...],
      "apparmor_profile": text | null}
 
-The layers are tried one by one, so that all that are missing are listed, where a jail would stop
-at the first.
+It tries the layers one by one and lists all missing ones; a jail would stop at the first.
 
-``surroundings`` is for a container, of which no claim is believed. The client asks an engine for
-one by its flags. An engine may ignore one with a warning (a limit that the host's control groups
-cannot give), and the flags say nothing of what works inside. So the server says what it reads and
-tries there, before it serves, and the client compares.
+``surroundings`` is for a container. The client starts one with an engine's flags, but an engine may
+ignore a flag with a warning (a limit that the host's control groups cannot give), and flags do not
+tell what works inside. So the server in the container reads and tries its confinement before it
+serves, and reports it; the client compares the report with its flags.
 """
 
 from __future__ import annotations
@@ -58,14 +57,14 @@ profile envhub-worker {python} flags=(unconfined) {{
 
 
 def main(argv: Sequence[str]) -> int:
-    """Print what this host can enforce as JSON."""
+    """Print the layers that this host can enforce as JSON."""
     os.umask(0o022)  # as for the server: what is tried must not depend on the caller's
     print(json.dumps(probe(), indent=2))
     return 0
 
 
 def probe() -> dict[str, Any]:
-    """Everything that this host can enforce. This process must be single-threaded."""
+    """Returns every layer that this host can enforce. This process must be single-threaded."""
     restricted = procfs.text("/proc/sys/kernel/apparmor_restrict_unprivileged_userns") == "1"
     return {
         "host": host_facts(),
@@ -75,7 +74,7 @@ def probe() -> dict[str, Any]:
 
 
 def host_facts() -> dict[str, Any]:
-    """Kernel, machine and user, with what depends on them."""
+    """Returns facts about kernel, machine and user."""
     name = os.uname()
     hierarchy = cgroups.discover()
     return {
@@ -90,12 +89,12 @@ def host_facts() -> dict[str, Any]:
 
 
 def apparmor_profile() -> str:
-    """For ``/etc/apparmor.d/envhub-worker``; then ``sudo apparmor_parser -r`` that file."""
+    """Returns the text for ``/etc/apparmor.d/envhub-worker``, loaded by ``apparmor_parser -r``."""
     return _APPARMOR.format(python=os.path.realpath(sys.executable))
 
 
 def try_layer(name: str, attempt: Callable[[], str]) -> dict[str, Any]:
-    """Run ``attempt`` in a child process, and return its result or why it failed."""
+    """Run ``attempt`` in a child process; return its result or the reason of its failure."""
     read, write = os.pipe()
     pid = os.fork()
     if pid == 0:
@@ -237,17 +236,19 @@ _LAYERS: dict[str, Callable[[], str]] = {
 
 
 def announcement(surroundings: Surroundings, **more: str) -> str:
-    """One line of JSON for the client that started the container. ``more``: of a server there."""
+    """Returns one line of JSON for the client that started the container. ``more``: further fields
+    about a server in it.
+    """
     return json.dumps({"envhub-worker": __version__, **vars(surroundings), **more})
 
 
 def own_runtime() -> Runtime:
-    """The default runtime of jails: in a derived image its environment."""
+    """Returns the jails' default runtime: the environment of a derived image, if it has one."""
     return Runtime(str(ENVIRONMENT)) if ENVIRONMENT.exists() else OWN
 
 
 def surroundings() -> Surroundings:
-    """What holds around this process. Call it before it has threads."""
+    """Returns the confinement around this process, which must be single-threaded."""
     status = _status()
     return Surroundings(
         profiles=tuple(profiles(probe()["layers"], landlock.version())),
@@ -266,7 +267,7 @@ def surroundings() -> Surroundings:
 
 
 def profiles(layers: list[dict[str, Any]], landlock_abi: int) -> list[str]:
-    """Which profiles' layers are all there; a pure function of what ``probe`` found."""
+    """Returns the profiles whose layers are all available by a result of ``probe``. Pure."""
     available = {layer["layer"] for layer in layers if layer["available"]}
     enforceable = ["strict"] if available >= _NAMESPACED else []
     if "seccomp" in available and landlock_abi >= LEAST_LANDLOCK["no-userns"]:
@@ -275,24 +276,24 @@ def profiles(layers: list[dict[str, Any]], landlock_abi: int) -> list[str]:
 
 
 def network_devices(table: str) -> list[str]:
-    """The names in ``/proc/net/dev``."""
+    """Returns the names in ``/proc/net/dev``."""
     return [line.partition(":")[0].strip() for line in table.splitlines() if ":" in line]
 
 
 def memory_limit(root: Path) -> int | None:
-    """Bytes, from cgroup v2 or v1; None where there is no limit."""
+    """Returns the memory limit in bytes, from cgroup v2 or v1; None without a limit."""
     limit = _number(root / "memory.max") or _number(root / "memory/memory.limit_in_bytes")
-    # under v1, "none" is written as the largest number of pages
+    # Cgroup v1 writes the largest number of pages for "no limit".
     return limit if limit is not None and limit < 1 << 60 else None
 
 
 def pids_limit(root: Path) -> int | None:
-    """Processes and threads, from cgroup v2 or v1; None where there is no limit."""
+    """Returns the limit of processes and threads, from cgroup v2 or v1; None without a limit."""
     return _number(root / "pids.max") or _number(root / "pids/pids.max")
 
 
 def cpus_limit(root: Path) -> float | None:
-    """Processors' worth of time, from cgroup v2 or v1; None where there is no limit."""
+    """Returns the CPU limit in processors, from cgroup v2 or v1; None without a limit."""
     quota, period = _words(root / "cpu.max", 2)
     if not quota:
         for folder in ("cpu", "cpu,cpuacct"):

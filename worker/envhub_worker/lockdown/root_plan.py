@@ -1,6 +1,6 @@
-"""What of the host's file system a jail sees: a pure plan, built by ``mounts``.
+"""The part of the host's file system that a jail sees: a pure plan, which ``mounts`` builds.
 
-Everything that is not named here does not exist in a jail.
+Files that this plan does not name do not exist in a jail.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _ETC_FILES = ("/etc/ld.so.cache", "/etc/localtime", "/etc/mime.types", "/etc/os-
 _NETWORK_FILES = ("/etc/resolv.conf", "/etc/hosts", "/etc/services", "/etc/gai.conf")
 _NETWORK_FOLDERS = ("/etc/ssl", "/etc/pki", "/etc/ca-certificates")
 _SYS_FOLDERS = ("/sys/devices/system/cpu", "/sys/devices/system/node")
-# Not /dev/zero, under no policy: mapped, it is shared memory that can be kept out of sight (see the
-# filter). No driver is known to need it.
+# /dev/zero is missing under every policy: a mapping of it is shared memory that can be hidden from
+# init (see the filter). No driver is known to need it.
 _DEVICES = ("/dev/null", "/dev/full", "/dev/random", "/dev/urandom")
 
 _TEXTS = {
@@ -52,11 +52,11 @@ _DEV_LINKS = {
 
 @dataclass(frozen=True)
 class RootPlan:
-    """What to put into an empty root, in this order.
+    """The content of a new root, in the order in which it is added.
 
     Attributes:
-        trees: Paths that appear where they are on the host, read-only, with all below them.
-        roots: The same for folders that snapshots lie in; a jail covers them up again.
+        trees: Paths that appear at the host's location, read-only, with everything below them.
+        roots: Folders with snapshots, which appear likewise; each jail then covers them.
         links: Symbolic links: path to target.
         texts: Files of our own: path to content.
     """
@@ -71,12 +71,12 @@ class RootPlan:
 
 @dataclass(frozen=True)
 class HostFiles:
-    """The few questions that the plan asks about the host's files.
+    """The functions by which the plan reads the host's files.
 
     Attributes:
-        readlink: A symbolic link's target, or None for anything else.
-        listdir: Names in a folder; empty where there is none.
-        read: What is in a small file; empty where there is none.
+        readlink: Returns a symbolic link's target, or None for any other file.
+        listdir: Returns the names in a folder; empty without that folder.
+        read: Returns the content of a small file; empty without that file.
     """
 
     exists: Callable[[str], bool]
@@ -95,15 +95,15 @@ def plan_root(
     network: str,
     host: HostFiles,
 ) -> RootPlan:
-    """The root for all jails of one zygote.
+    """Plans the root for all jails of one zygote.
 
     Args:
         interpreter: Paths that the interpreter needs: prefixes, ``sys.path``, this package.
-        readable: Paths that the caller grants by name, and what its devices need of /sys.
-        roots: Folders that snapshots lie in; each jail later sees only its own snapshot.
+        readable: Paths that the caller grants by name, and paths of /sys that its devices need.
+        roots: Folders with snapshots; each jail later sees only its own snapshot.
         private: Folders that must never appear because an interpreter names something above
             them (a ``sys.path`` entry that is somebody's home).
-        network: ``"host"`` adds what name resolution and TLS read.
+        network: ``"host"`` adds the files that name resolution and TLS read.
     """
     links: dict[str, str] = dict(_DEV_LINKS)
     named = {path: {path, resolve(path, host, {})} for path in interpreter}  # and what it leads to
@@ -135,7 +135,7 @@ def plan_root(
 
 
 def outermost(paths: Iterable[str]) -> tuple[str, ...]:
-    """``paths`` in order, without those that lie in another one."""
+    """Returns ``paths`` in order, without those below another of them."""
     kept: list[str] = []
     for path in sorted(set(paths)):
         if not any(within(path, other) for other in kept):
@@ -149,7 +149,7 @@ def within(path: str, folder: str) -> bool:
 
 
 def resolve(path: str, host: HostFiles, links: dict[str, str]) -> str:
-    """The real path; every symbolic link on the way is noted in ``links``."""
+    """Returns the real path; adds every symbolic link on the way to ``links``."""
     current, pending = "/", path.strip("/").split("/")
     for _ in range(256):  # more than the kernel's own limit of 40 links can need
         if not pending:

@@ -1,4 +1,4 @@
-"""What one jail is made for: a snapshot, its entry file and what it is permitted."""
+"""The specification of one jail: a snapshot, its entry file and its permissions."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class JailSpec:
 
     Attributes:
         snapshot: Absolute path of the read-only snapshot root.
-        entry: The entry file, relative to it.
-        hub_copies: What its cache of the Hub holds.
+        entry: The entry file, relative to the snapshot.
+        hub_copies: The repositories in the jail's Hub cache.
     """
 
     snapshot: str
@@ -38,7 +38,7 @@ class JailSpec:
     hub_copies: tuple[HubCopy, ...] = ()
 
     def to_wire(self) -> dict[str, Any]:
-        """Plain data for a channel between our own processes."""
+        """Returns plain data for a channel between our own processes."""
         return asdict(self)
 
     @classmethod
@@ -50,10 +50,10 @@ class JailSpec:
 
 
 def confinement_from_wire(data: dict[str, Any]) -> Confinement:
-    """A ``Confinement`` from its ``dataclasses.asdict`` form, lists for tuples permitted.
+    """Reads a ``Confinement`` from its ``dataclasses.asdict`` form; lists may stand for tuples.
 
     Trust: a client on another host may have written it.
-    Raises ``RemoteProtocolError``: a name, type or number that there cannot be.
+    Raises ``RemoteProtocolError``: a name, a type or a number is invalid.
     """
     names = {item.name for item in fields(Confinement)}
     if set(data) != names:

@@ -1,1 +1,1 @@
-"""How much a jail may use: by the kernel where it counts, measured elsewhere."""
+"""Limits of a jail's resources: enforced by the kernel where it counts them, else by measuring."""

@@ -1,8 +1,8 @@
-"""Memory and process counts by the kernel, where this process may make control groups.
+"""Limits of memory and processes by control groups, where this process may make them.
 
-As root under cgroup v1 or v2, or as a user who was delegated a v2 group. The server makes a
-group for each jail; a runner joins it before anything else, through descriptors that the server
-opened. Where there is none, ``watchdog`` measures instead.
+That takes root under cgroup v1 or v2, or a delegated v2 group. The server makes a group for each
+jail; a runner joins it before anything else, through descriptors that the server opened. Without
+control groups ``watchdog`` measures instead.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _PREFIX = "envhub_"
 
 @dataclass(frozen=True)
 class Hierarchy:
-    """Where groups for jails can be made.
-    ``kind``: ``"cgroup-v1"`` or ``"cgroup-v2"``; ``folders``: of each controller; under v2 one.
+    """A hierarchy in which groups for jails can be made.
+    ``kind``: ``"cgroup-v1"`` or ``"cgroup-v2"``; ``folders``: one for each controller; v2 has one.
     """
 
     kind: str
@@ -34,11 +34,11 @@ class Hierarchy:
 
 
 def find(mounts: str, own: str, *, root: bool) -> Hierarchy | None:
-    """Where to make groups, by what ``/proc/self/mountinfo`` and ``/proc/self/cgroup`` say. Pure.
-    ``root``: whether we are root: then a v2 group may stand at the top, whatever our own is.
+    """Finds the hierarchy from ``/proc/self/mountinfo`` and ``/proc/self/cgroup``. Pure.
+    ``root``: whether we are root, who may make a v2 group at the top, wherever our own group is.
     """
     entries = [line.split(":", 2) for line in own.splitlines()]
-    # by controller; the v2 hierarchy is the controller ''
+    # By controller; the v2 hierarchy has the empty name.
     paths = {name: path for _, names, path in entries for name in names.split(",")}
     points = _mount_points(mounts)
     if root and "memory" in points and "pids" in points:
@@ -62,7 +62,7 @@ def _mount_points(mounts: str) -> dict[str, str]:
 
 
 def discover() -> Hierarchy | None:
-    """The hierarchy of this process, if groups with limits can really be made in it."""
+    """Returns the hierarchy of this process if a trial group with limits can be made in it."""
     with open(_MOUNTS) as mounts, open(_OWN) as own:
         hierarchy = find(mounts.read(), own.read(), root=os.geteuid() == 0)
     if hierarchy is None or not all(os.access(path, os.W_OK) for path in hierarchy.folders):
@@ -73,8 +73,8 @@ def discover() -> Hierarchy | None:
 class Tree:
     """The folder that holds the groups of one spawner's jails.
 
-    Its lock is held as long as this process lives: by that others know that it is in use, in
-    whatever namespace they are. Its name says nothing of the host: jails read it.
+    This process holds a lock on it for life, by which other servers know that it is in use, also
+    from other namespaces. Its name tells nothing about the host, for jails can read it.
     """
 
     def __init__(self, hierarchy: Hierarchy, name: str) -> None:
@@ -99,7 +99,7 @@ class Tree:
             raise
 
     def group(self, name: str, limits: Limits) -> Group:
-        """A new group with ``limits``. Raises ``OSError``: the kernel refuses."""
+        """Makes a group with ``limits``. Raises ``OSError``: the kernel refuses."""
         return Group(self.kind, [f"{folder}/{name}" for folder in self._folders], limits)
 
     def remove(self) -> None:
@@ -114,7 +114,7 @@ def _made_and_locked(folder: str, *, exist_ok: bool = False) -> int:
     """Create a group and return the descriptor that holds its lock."""
     while True:
         os.makedirs(folder, exist_ok=exist_ok)
-        # another server may find it before it is locked, and remove it
+        # Another server may find the group before it is locked, and remove it: then try again.
         with contextlib.suppress(FileNotFoundError):
             lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -181,12 +181,12 @@ class Group:
             raise
 
     def open(self) -> list[int]:
-        """Descriptors for init: where out-of-memory is counted, then where to join."""
+        """Descriptors for init: the file that counts out-of-memory, then the files for joining."""
         newer = self.kind == "cgroup-v2"
         name = "memory.events" if newer else "memory.oom_control"
         events = os.open(f"{self._folders[0]}/{name}", os.O_RDONLY | os.O_CLOEXEC)
-        # A thread that moves itself alone needs no lock that waits for every core: 0.1 ms
-        # instead of 12. Version 2 has no such file between groups like ours.
+        # A thread that moves only itself takes no lock that waits for every core: 0.1 ms instead
+        # of 12. Version 2 has no file for that between groups like ours.
         file = "cgroup.procs" if newer else "tasks"
         joins = [
             os.open(f"{folder}/{file}", os.O_WRONLY | os.O_CLOEXEC) for folder in self._folders
@@ -194,7 +194,7 @@ class Group:
         return [events, *joins]
 
     def refused(self) -> bool:
-        """Whether the kernel has refused it a process, or a thread, beyond its number."""
+        """Whether the kernel has refused the jail a process or thread over its limit."""
         with contextlib.suppress(OSError), open(f"{self._folders[-1]}/pids.events") as file:
             return any(line.startswith("max ") and line.split()[1] != "0" for line in file)
         return False
@@ -205,7 +205,7 @@ class Group:
 
 
 def _settings(kind: str, folders: Sequence[str], limits: Limits) -> list[tuple[str, str, bool]]:
-    """(file, content, whether it must exist)."""
+    """Yields the group's settings: (file, content, whether the file must exist)."""
     memory, processes = str(limits.memory_bytes), str(limits.processes)
     if kind == "cgroup-v2":
         return [
@@ -222,7 +222,7 @@ def _settings(kind: str, folders: Sequence[str], limits: Limits) -> list[tuple[s
 
 
 def oom_kills(events: int) -> int:
-    """How often the kernel ended a process of the group for its memory."""
+    """Returns how many processes of the group the kernel has killed for memory."""
     for line in os.pread(events, 4096, 0).splitlines():
         name, _, count = line.partition(b" ")
         if name == b"oom_kill":
@@ -248,9 +248,9 @@ OUTER_LIMIT = (
 
 
 class SurroundingLimit:
-    """The memory limit around the server itself: a container's, which all its jails share.
+    """The memory limit around the server itself: that of its container, which all jails share.
 
-    Tells a process that was killed for that limit from one that was killed otherwise.
+    It tells whether a process was killed for that limit.
     """
 
     def __init__(self, root: Path = Path("/sys/fs/cgroup")) -> None:
@@ -262,7 +262,7 @@ class SurroundingLimit:
         self._seen = self._count()
 
     def killed_one(self) -> bool:
-        """Whether the kernel has ended one more process for it since this was asked last."""
+        """Whether the kernel has killed a process for this limit since the last call."""
         if self._count() <= self._seen:
             return False
         self._seen += 1

@@ -1,9 +1,9 @@
 """Ends a jail over its limits: measures memory and scratch where no cgroup and no quota count them.
 
-A resource limit counts one process, and misses files in memory (memfd), shared anonymous memory
-and what waits in sockets and pipes. So init looks at all processes of the jail, the sooner the
-nearer they are to the limit, and ends them over it. What it cannot see the filter denies
-(``seccomp.policy.policy_table``, "measured") or the kernel bounds; ``plan`` names what remains.
+A resource limit counts one process and misses files in memory (memfd), shared anonymous memory,
+and data that waits in sockets and pipes. So init measures all processes of the jail, more often
+near the limit, and ends them when they are over it. The filter denies the memory that init cannot
+see (``seccomp.policy.policy_table``, "measured"), or the kernel bounds it; ``plan`` names the rest.
 """
 
 from __future__ import annotations
@@ -33,25 +33,26 @@ _SHARED = re.compile(
     re.MULTILINE,
 )
 
-# Of the kernel's own memory, generously: a mapping with what reverses it, and an open file.
+# Generous sizes of the kernel's own memory: for a mapping with its reverse mapping, and for an open
+# file.
 _MAPPING, _DESCRIPTOR = 512, 1024
-# Of an entry of a tmpfs that holds no block: inode, names, and what lists them in their folder. It
-# also counts attributes as so many entries, of 1 KiB each.
+# Size of an entry of a tmpfs without blocks: inode, names, and their listing in the folder. The
+# tmpfs counts extended attributes as entries of 1 KiB each.
 _ENTRY = 2048
-# The filter keeps pipes, and buffers of sockets, at the size that they are made with.
+# Size of a pipe. The filter denies changing the sizes of pipes and of socket buffers.
 _PIPE = 64 * 1024
-# Of a socket, where the host does not say.
+# Size of a socket's buffer if the host does not tell it.
 _BUFFER = 212992
 
 
 def seconds_to_next_look(used: int, limit: int) -> float:
-    """How long nothing can happen: the headroom over the rate at which memory can be filled."""
+    """Returns how long the limit is safe: the headroom over the rate at which memory can fill."""
     return min(max((limit - used) / _FILL_RATE, _SHORTEST_S), _LONGEST_S)
 
 
 @dataclass
 class Usage:
-    """Memory of a jail in bytes, as far as it can be had cheaply; never less than it is.
+    """Memory of a jail in bytes, measured cheaply: an upper bound.
 
     Attributes:
         private: Anonymous memory of each process, swap included.
@@ -71,13 +72,13 @@ class Usage:
 
 
 class MemoryWatch:
-    """Looks at the memory of a jail's processes.
+    """Measures the memory of a jail's processes.
 
     Args:
-        limit: Bytes.
-        tmpfs: A path in the jail's own, if it has one.
-        own_network: Whether all sockets of our network namespace are the jail's, those too that
-            wait in another socket, where no process has them.
+        limit: The memory limit in bytes.
+        tmpfs: A path in the jail's own tmpfs, if it has one.
+        own_network: Whether all sockets of our network namespace belong to the jail, including
+            those that wait in another socket and that no process has open.
     """
 
     def __init__(self, limit: int, tmpfs: str | None, *, own_network: bool = False) -> None:
@@ -87,19 +88,17 @@ class MemoryWatch:
         self._foreign: set[tuple[int, int]] = set()
 
     def ignore(self, fds: Iterable[int]) -> None:
-        """Do not count these files: they are the client's (slabs)."""
+        """Do not count these files, which belong to the client (slabs)."""
         for fd in fds:
             status = os.fstat(fd)
             self._foreign.add((status.st_dev, status.st_ino))
 
     def look(self, pids: Collection[int]) -> tuple[int, list[int]]:
-        """(bytes in use, pids that cannot be measured).
-
-        The cheap upper bound first, in which pages that forked processes share count for each; only
-        when that is over the limit, what is really there. Shared memory may have left every page
-        table, where no process's account shows it: it is what its mappings may hold, or less where
-        the whole machine has less.
-        """
+        """Returns (bytes in use, pids that cannot be measured)."""
+        # The cheap upper bound comes first: it counts pages that forked processes share once for
+        # each. Only if that is over the limit is the exact amount read. Shared memory may have left
+        # every page table, so no process's account shows it: it counts with the size of its
+        # mappings, but with no more than the whole machine shares.
         usage, hidden = self._usage(pids)
         shared = sum(usage.mapped.values())
         buffers = len(usage.sockets) * socket_bytes() + len(usage.pipes) * _PIPE
@@ -143,7 +142,7 @@ def _add_process(usage: Usage, pid: int) -> None:
 
 
 def _add_mappings(usage: Usage, pid: int) -> None:
-    """Count each shared object by its largest mapping, but no less than the filter lets be made.
+    """Count each shared object by its largest mapping, at least by the filter's maximum size.
 
     Shared memory keeps its unmapped pages as long as one page of it is mapped.
     """
@@ -176,7 +175,7 @@ def _add_descriptors(usage: Usage, pid: int) -> None:
 
 @functools.cache
 def socket_bytes() -> int:
-    """The most that waits in one socket: what fills its buffer, and a message that went in last."""
+    """Returns the maximum bytes in one socket: a full buffer and one last message."""
     return 2 * int(procfs.content("/proc/sys/net/core/wmem_default") or _BUFFER) + _DESCRIPTOR
 
 
@@ -187,14 +186,14 @@ def _sockets() -> int:
 
 
 def shared_of_the_machine() -> int:
-    """All memory that processes of this machine share, and files in memory."""
+    """Returns the bytes of shared memory and of files in memory on the whole machine."""
     fields = procfs.numbers("/proc/meminfo")
     swapped = fields.get(b"SwapTotal", 0) - fields.get(b"SwapFree", 0)
     return fields.get(b"Shmem", 0) + swapped
 
 
 def unlinked_bytes(pids: Iterable[int], device: int) -> int:
-    """What files of ``device`` take that have no name any more, but that somebody has open."""
+    """Returns the bytes of files of ``device`` that are unlinked but still open."""
     sizes: dict[int, int] = {}
     for pid in pids:
         folder = f"/proc/{pid}/fd"
@@ -208,16 +207,16 @@ def unlinked_bytes(pids: Iterable[int], device: int) -> int:
 
 
 def _proportional(pid: int) -> int:
-    """This process's share of anonymous memory: shared pages divided among their owners.
+    """Returns a process's share of anonymous memory: shared pages are divided among their owners.
 
-    Changed pages of a file that is mapped privately are anonymous too.
+    Changed pages of a privately mapped file are anonymous, too.
     """
     fields = procfs.numbers(f"/proc/{pid}/smaps_rollup")
     return fields.get(b"Pss_Anon", fields.get(b"Pss", 0)) + fields.get(b"SwapPss", 0)
 
 
 def folder_usage(root: str, most_files: int) -> tuple[int, int]:
-    """(bytes, files) below ``root``; stops counting above ``most_files``."""
+    """Returns (bytes, files) below ``root``; stops counting above ``most_files``."""
     size = files = 0
     pending = [root]
     while pending and files <= most_files:
@@ -231,16 +230,16 @@ def folder_usage(root: str, most_files: int) -> tuple[int, int]:
     return size, files
 
 
-# Counting files may take long; it then happens the more seldom.
+# A count of files may take long. The next one waits this many times as long.
 _DISK_SHARE = 20
 _DISK_LOOK_S = 0.5
-# The kernel has already acted; this only ends what it left, and gives it its name.
+# The kernel has killed a process already; the watchdog ends the rest and reports the reason.
 _EVENTS_LOOK_S = 0.5
 
 
 class Watchdog:
-    """Memory, by its control group's account or by measuring; scratch where no quota bounds it.
-    ``events``: where the control group counts out-of-memory; -1 to measure instead.
+    """Watches memory, by a control group's count or by measuring, and a scratch without a quota.
+    ``events``: descriptor of the control group's out-of-memory count; -1 to measure instead.
     """
 
     def __init__(self, jail: JailContext, events: int) -> None:
@@ -255,11 +254,11 @@ class Watchdog:
         self._disk_due = time.monotonic() if self._folder else float("inf")
 
     def seconds_left(self) -> float:
-        """Until the next look."""
+        """Returns the seconds until the next look."""
         return max(0.0, min(self._memory_due, self._disk_due) - time.monotonic())
 
     def look(self, pids: Collection[int]) -> tuple[Reason, str] | None:
-        """(reason, detail) when the jail must end, else None."""
+        """Returns (reason, detail) if the jail must end, else None."""
         now = time.monotonic()
         verdict = None
         if now >= self._memory_due:
@@ -282,7 +281,7 @@ class Watchdog:
             return self.killed_by_kernel()
         used, hidden = self.memory.look(pids)
         for pid in hidden:
-            # It runs a program that may not be read, and so cannot be measured.
+            # Such a process runs a program that may not be read, so nobody can measure it.
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
         limit = self._limits.memory_bytes

@@ -1,1 +1,1 @@
-"""One file a mechanism of the kernel. Own ctypes code: no system library is needed."""
+"""One module for each kernel mechanism. They call the kernel by ctypes and need no libraries."""

@@ -17,7 +17,7 @@ THREAD_TIMEOUT = "20"
 spin for a tenth of a second after their start and after each use, on the cores of its siblings and
 of the client, and its page faults would wait for them."""
 
-# A jail has no display, sound card or terminal; without these, libraries look for them.
+# A jail has no display, sound card or terminal. With these variables libraries look for none.
 _HEADLESS = {
     "MPLBACKEND": "Agg",
     "MUJOCO_GL": "egl",
@@ -27,15 +27,15 @@ _HEADLESS = {
     "SDL_VIDEODRIVER": "dummy",
 }
 
-# A jail has no network: without these, such programs try again for some twenty seconds.
+# A jail has no network. These variables stop libraries from retrying for some twenty seconds.
 _OFFLINE = {"HF_HUB_OFFLINE": "1", "PIP_RETRIES": "0", "UV_OFFLINE": "1"}
 
 
 def zygote_environment(
     host: Mapping[str, str], python: str, granted: Mapping[str, str]
 ) -> dict[str, str]:
-    """What the zygote is executed with. ``host`` gives language and time zone, nothing else.
-    ``granted``: what ``start_variables.at_start`` gives.
+    """Returns the zygote's environment. Only language and time zone come from ``host``.
+    ``granted``: the result of ``start_variables.at_start``.
     """
     return {
         **{name: host[name] for name in _INHERITED if name in host},
@@ -55,8 +55,8 @@ def jail_environment(
     temporary: str,
     network: str = "none",
 ) -> dict[str, str]:
-    """What a runner of a jail sees.
-    ``granted``: variables that the caller grants by name; they win.
+    """Returns the environment of a jail's runner.
+    ``granted``: variables that the caller grants by name; these override others.
     """
     kept = {name: value for name, value in base.items() if name in _KEPT}
     return {
@@ -66,7 +66,7 @@ def jail_environment(
         "HF_HOME": f"{home}/.cache/huggingface",
         "HOME": home,
         "LOGNAME": "sandbox",
-        # bytecode would be written to each jail's scratch; child processes inherit this
+        # Bytecode would fill each jail's scratch. Child processes inherit this variable.
         "PYTHONDONTWRITEBYTECODE": "1",
         "TMPDIR": temporary,
         "USER": "sandbox",

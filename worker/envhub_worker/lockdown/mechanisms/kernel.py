@@ -1,4 +1,4 @@
-"""System calls through ctypes: what the standard library does not offer."""
+"""System calls that the standard library lacks, through ctypes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _CAPABILITY_VERSION_3 = 0x20080522
 def syscall(
     name: str, *args: int | bytes | ctypes.Array[ctypes.c_char] | None, path: str | None = None
 ) -> int:
-    """Call the kernel. Integers are passed as longs, bytes as pointers.
+    """Make a system call. Integers are passed as longs, bytes as pointers.
     Raises ``OSError``, which names ``path``.
     """
     words = [ctypes.c_long(arg) if isinstance(arg, int) else arg for arg in args]
@@ -70,7 +70,7 @@ def mount(source: str, target: str, kind: str, flags: int = 0, options: str = ""
 
 
 def unmount(target: str) -> None:
-    """Detach whatever is mounted at ``target``, now; it goes when it is not used any more."""
+    """Detach the mount at ``target`` now; the kernel frees it after its last use."""
     _checked(_libc.umount2(os.fsencode(target), ctypes.c_int(MNT_DETACH)), target)
 
 
@@ -80,7 +80,7 @@ def pivot_root(new_root: str, put_old: str) -> None:
 
 
 def clone_tree(path: str) -> int:
-    """A detached copy of the mounts at and below ``path``, as a descriptor."""
+    """Returns a descriptor of a detached copy of the mounts at and below ``path``."""
     flags = _OPEN_TREE_CLONE | _OPEN_TREE_CLOEXEC | _AT_RECURSIVE
     return syscall("open_tree", _AT_FDCWD, os.fsencode(path), flags, path=path)
 
@@ -92,7 +92,7 @@ def restrict_tree(tree: int, attributes: int, *, userns: int = 0) -> None:
 
 
 def restrict_mount(path: str, attributes: int) -> None:
-    """Add mount ``attributes`` to the one mount at ``path``."""
+    """Add mount ``attributes`` to the mount at ``path``, without those below it."""
     words = struct.pack("=QQQQ", attributes, 0, 0, 0)
     syscall("mount_setattr", _AT_FDCWD, os.fsencode(path), 0, words, len(words))
 

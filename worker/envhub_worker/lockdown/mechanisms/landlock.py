@@ -1,7 +1,8 @@
-"""Landlock: which files a thread and its descendants may open, bind, connect and signal.
+"""Landlock: restricts which files a thread and its descendants may open, which TCP ports they may
+bind and connect, and which processes they may signal.
 
-It stops neither chmod, utime and setxattr nor sockets other than TCP, and it binds the calling
-thread only: call it before any other thread exists.
+It stops neither chmod, utime and setxattr nor sockets other than TCP. It binds the calling thread
+only: call it before any other thread exists.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _SCOPE_ABSTRACT_UNIX_SOCKET, _SCOPE_SIGNAL = 1, 2
 
 @dataclass(frozen=True)
 class LandlockRule:
-    """What is permitted at and below a path."""
+    """The rights that are granted at and below a path."""
 
     path: str
     access: int
@@ -45,7 +46,7 @@ class LandlockRule:
 
 @dataclass(frozen=True)
 class Ruleset:
-    """What the kernel is asked to handle; everything handled is denied but for the rules."""
+    """The rights that Landlock handles: it denies each handled right that no rule grants."""
 
     files: int
     tcp: int
@@ -53,8 +54,8 @@ class Ruleset:
 
 
 def ruleset(abi: int, network: str) -> Ruleset:
-    """All that ``abi`` can handle. An unknown bit would be refused, so it is clamped.
-    ``network``: ``"none"`` denies all TCP; otherwise its own layer decides.
+    """Returns all rights that ``abi`` can handle; the kernel would refuse an unknown bit.
+    ``network``: ``"none"`` denies all TCP; otherwise the network layer decides.
     """
     bits = {1: 13, 2: 14, 3: 15, 4: 15}.get(abi, 16)
     return Ruleset(
@@ -65,7 +66,7 @@ def ruleset(abi: int, network: str) -> Ruleset:
 
 
 def scopes(abi: int) -> bool:
-    """Whether signals and abstract sockets end at the domain."""
+    """Whether ``abi`` keeps signals and abstract sockets inside the domain."""
     return abi >= 6
 
 
@@ -85,8 +86,8 @@ def restrict(handled: Ruleset, rules: Iterable[LandlockRule]) -> None:
     """
     try:
         words = struct.pack("=QQQ", handled.files, handled.tcp, handled.scope)
-        # A kernel refuses a structure that is longer than its own, unless the rest is zero; the
-        # first ones know the first field only.
+        # A kernel refuses a structure longer than its own unless the rest is zero. The first
+        # kernels with Landlock know the first field only.
         size = 24 if handled.scope else 16 if handled.tcp else 8
         fd = kernel.syscall("landlock_create_ruleset", words, size, 0)
         try:
@@ -115,7 +116,7 @@ def _add(ruleset_fd: int, rule: LandlockRule, handled: int) -> None:
 
 
 def unavailable(error: OSError) -> LayerUnavailableError:
-    """Why this host has no Landlock, and what to do."""
+    """Returns the error that says why this host has no Landlock, and what to do."""
     if error.errno == errno.ENOSYS:
         reason = "this kernel has no Landlock (it needs Linux 5.13), or a container hides it"
         fix = "Use a newer kernel; in a container, a runtime whose seccomp profile allows it."

@@ -1,7 +1,7 @@
-"""A folder of a server's own among the temporary files, locked for as long as the server lives.
+"""A temporary folder of a server, locked for as long as the server lives.
 
-A server that is ended by SIGKILL leaves its folders behind. The kernel gives the lock back, so the
-next server, or ``envhub cache gc``, can tell and remove them.
+A server that SIGKILL ends leaves its folders behind. The kernel releases the lock, by which the
+next server or ``envhub cache gc`` recognises and removes them.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _LONGEST = "/envhub-12345678/fds"
 
 
 class LockedFolder:
-    """A new one. It is private; its owner may let others pass.
-    ``place``: where it lies; by default below the folder for temporary files.
+    """A new private folder with a lock; its owner may open it to others.
+    ``place``: its parent folder; by default the one for temporary files.
     """
 
     def __init__(self, prefix: str, parent: Path | None = None) -> None:
@@ -35,7 +35,7 @@ class LockedFolder:
         os.rename(new, self.path / _LOCK)  # under that name it is never seen without its lock
 
     def remove(self) -> None:
-        """Remove it, with all that is in it. Idempotent."""
+        """Remove the folder and its content. Idempotent."""
         with contextlib.suppress(FileNotFoundError):
             remove_tree(str(self.path))
         if self._lock >= 0:
@@ -44,13 +44,13 @@ class LockedFolder:
 
 
 def place_for_sockets() -> Path:
-    """The folder for temporary files; where its path is too long for a socket's, ``/tmp``."""
+    """Returns the temporary folder; ``/tmp`` if a socket's path in that would be too long."""
     folder = Path(tempfile.gettempdir())
     return folder if len(os.fsencode(folder)) + len(_LONGEST) <= _SOCKET_BYTES else Path("/tmp")
 
 
 def remove_deserted(parent: Path) -> None:
-    """Remove folders of ours whose server has gone."""
+    """Remove this project's folders whose server has ended."""
     for path in parent.iterdir():
         with contextlib.suppress(OSError):
             if _NAME.fullmatch(path.name) and path.lstat().st_uid == os.geteuid():
@@ -60,9 +60,9 @@ def remove_deserted(parent: Path) -> None:
 
 @contextlib.contextmanager
 def unheld(path: str | Path) -> Iterator[None]:
-    """Keep the lock of a file or a folder that no process holds free until this context ends.
-    Raises ``BlockingIOError``: a process holds it; ``OSError``: there is no such file, or the file
-    system has no locks.
+    """Hold a shared lock of a file or folder, so that no server can take it inside the context.
+    Raises ``BlockingIOError``: a server holds the lock; ``OSError``: there is no such file, or the
+    file system has no locks.
     """
     fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:

@@ -1,9 +1,9 @@
-"""Building a private, read-only root, and what each jail mounts over it.
+"""Builds a private, read-only root, and mounts each jail's own file systems over it.
 
-Twice: the zygote builds the root that its jails have in common, once; a jail's init then hides
-all snapshots but its own, mounts its scratch and its proc, and puts its snapshot and its packages
-under overlays: it may write there, and what is shared stays as it is. Mount points
-that a jail needs lie where the path says, so a snapshot below ``/tmp`` is no special case.
+This happens in two steps. The zygote builds the root that its jails share. Then a jail's init hides
+all snapshots but its own, mounts its scratch and its proc, and puts overlays over its snapshot and
+its packages: the jail may write there, and the shared files do not change. Mount points keep the
+host's paths, so a snapshot below ``/tmp`` is no special case.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MAX_TERMINALS = 64
 """Pseudo terminals of one jail: each is some 40 KiB of the kernel's memory in no account, and all
 users of a host, its own programs apart, have 3,072."""
 
-# Of what /proc shows about the host, this stays: libraries ask for it. The rest is covered.
+# Files of /proc about the host that stay visible, since libraries read them. The rest is covered.
 _PROC_KEPT = frozenset(
     {
         *("cgroups", "cpuinfo", "devices", "filesystems", "loadavg", "meminfo", "mounts", "net"),
@@ -44,26 +44,27 @@ _PROC_KEPT = frozenset(
 )
 
 
-# Below what stays: it is the same for all jails of a host, and for no other.
+# Covered although they lie below a visible folder: they identify the host.
 _PROC_COVERED = ("/proc/sys/kernel/random/boot_id",)
 
 
 def enter_root(plan: RootPlan, root: str, copied: Sequence[str], user: int | None) -> None:
-    """Make ``place`` a root with what ``plan`` says and the host's /proc; enter it, detach the old.
+    """Make ``place`` a root with the plan's files and the host's /proc; enter it, detach the old.
 
     Needs a mount namespace of our own; nothing propagates out of it.
 
     Args:
-        copied: Folders whose files are to be the jails' own there, so that overlays can copy them.
-        user: The user of the jails, where that is not this process's own.
+        copied: Folders whose files the new root shows as the jails' own, so that overlays can copy
+            them.
+        user: The user of the jails if it differs from this process's own, else None.
     """
     kernel.mount("none", "/", "none", kernel.MS_REC | kernel.MS_PRIVATE)
-    # Before the new root is mounted, which may itself lie below one of the trees.
+    # The trees are cloned before the new root is mounted, which may lie below one of them.
     own = {} if user is None else _take_for(user, root_plan.outermost(copied))
     shown = root_plan.outermost((*plan.trees, *plan.roots))
     trees = _take((path for path in shown if path not in own), _READ_ONLY)
     trees |= _take(plan.devices, kernel.ATTR_NOSUID | kernel.ATTR_NOEXEC)
-    # A new proc may be mounted only where an unmasked one is in sight, so bring the old along.
+    # The kernel permits a new proc only where an unmasked one is visible, so keep the old one.
     trees |= _take(("/proc",), 0)
     files = {path: Path(path).read_bytes() for path in plan.copies}
     files |= {path: text.encode() for path, text in plan.texts.items()}
@@ -83,7 +84,7 @@ def enter_root(plan: RootPlan, root: str, copied: Sequence[str], user: int | Non
 
 
 def _take(paths: Iterable[str], attributes: int) -> dict[str, int]:
-    """For each path a detached copy of the mount tree there."""
+    """Returns a detached copy of the mount tree at each path."""
     trees = {}
     for path in paths:
         trees[path] = kernel.clone_tree(path)
@@ -93,7 +94,7 @@ def _take(paths: Iterable[str], attributes: int) -> dict[str, int]:
 
 
 def _take_for(user: int, paths: Iterable[str]) -> dict[str, int]:
-    """As ``_take``, with root's files owned by ``user``; without paths that cannot be mapped so."""
+    """Like ``_take``, but root's files belong to ``user``; omits paths that cannot be mapped so."""
     trees: dict[str, int] = {}
     with contextlib.suppress(OSError):
         users = namespaces.mapped_to(user)
@@ -127,17 +128,17 @@ def _write(path: str, content: bytes) -> None:
 def _link(path: str, target: str) -> None:
     os.makedirs(os.path.dirname(path), 0o755, exist_ok=True)
     with contextlib.suppress(OSError):
-        # Where the parent is a read-only tree of the host, the link is already in it.
+        # If the parent is a read-only tree of the host, it has the link already.
         os.symlink(target, path)
 
 
 def mount_proc() -> None:
-    """A /proc of our own pid namespace, over whatever is there."""
+    """Mount a /proc of our own pid namespace over the present one."""
     kernel.mount("proc", "/proc", "proc", _PLAIN | kernel.MS_NOEXEC)
 
 
 def proc_to_cover() -> tuple[list[str], list[str]]:
-    """(files, folders) of /proc that a jail has no use for and could read."""
+    """Returns the (files, folders) of /proc that a jail does not need but could read."""
     files = list(filter(os.path.exists, _PROC_COVERED))
     folders: list[str] = []
     for name in sorted(os.listdir("/proc")):
@@ -150,7 +151,7 @@ def proc_to_cover() -> tuple[list[str], list[str]]:
 
 
 def cover_proc(files: Sequence[str], folders: Sequence[str]) -> None:
-    """Hide each of ``files`` and ``folders`` of the mounted /proc under something empty."""
+    """Hide ``files`` and ``folders`` of the mounted /proc under empty files and folders."""
     for path in files:
         _bind("/dev/null", path)
     for path in folders:
@@ -164,11 +165,11 @@ def _bind(source: str, target: str) -> None:
 
 
 class View(NamedTuple):
-    """How a jail sees its snapshot and its packages.
+    """The mounts of a jail's snapshot and packages.
 
     Attributes:
-        shared: Path of each that is copy on write: descriptor of the shared folder below.
-        refused: Path of each that is read-only: why this host has no overlay for it.
+        shared: By path of each copy-on-write mount: descriptor of the shared folder below it.
+        refused: By path of each read-only mount: why this host has no overlay for it.
     """
 
     shared: dict[str, int]
@@ -178,7 +179,8 @@ class View(NamedTuple):
 def mount_skeleton(packages: str) -> None:
     """Mirror the folders of ``packages``, owned by the jails' user, for each jail's overlay.
 
-    Without them the folders in an overlay would be read-only or another user's, as the shared ones.
+    Without the mirror, folders in an overlay would be read-only or another user's, like the shared
+    ones.
     """
     kernel.mount("skeleton", _SKELETON, "tmpfs", _PLAIN, "mode=755")
     _mirror_folders(packages, f"{_SKELETON}/packages")
@@ -195,13 +197,13 @@ def mount_jail(
     size: int,
     inodes: int,
 ) -> View:
-    """Everything that is one jail's own; needs a mount namespace of its own.
+    """Mount everything that belongs to one jail. Needs a mount namespace of its own.
 
     Args:
-        snapshot: Shown at this path; everything else below ``roots`` is hidden.
-        packages: Folder of packages of its own, with a skeleton; or empty.
-        trees: What the zygote's root shows (``RootPlan.trees``).
-        links: Its links, of which some may lead to the interpreter.
+        snapshot: The jail's snapshot, shown at this path; the rest below ``roots`` is hidden.
+        packages: The jail's folder of packages, which has a skeleton; or empty.
+        trees: The trees of the zygote's root (``RootPlan.trees``).
+        links: The links of that root, some of which may lead to the interpreter.
     """
     hidden = [*roots, TEMPORARY, SHARED_MEMORY, HOME, WORK]
     buried = [path for path in trees if any(within(path, folder) for folder in hidden)]
@@ -223,7 +225,7 @@ def mount_jail(
 
 
 def _mount_scratch(size: int, inodes: int) -> None:
-    """One tmpfs, so that home, temporary files and work share one quota."""
+    """Mount one tmpfs, so that home, temporary files and work share one quota."""
     options = f"size={size},nr_inodes={inodes},mode=700"
     kernel.mount("scratch", _SCRATCH, "tmpfs", _PLAIN, options)
     for name, target in (("home", HOME), ("tmp", TEMPORARY), ("shm", SHARED_MEMORY)):
@@ -233,7 +235,7 @@ def _mount_scratch(size: int, inodes: int) -> None:
 
 
 def _mount_terminals() -> None:
-    """Mount the jail's own devpts, whose terminals nobody else sees, if the host permits it."""
+    """Mount the jail's own devpts, if the host permits it; no other process sees its terminals."""
     with contextlib.suppress(OSError):
         options = f"newinstance,ptmxmode=666,mode=600,max={_MAX_TERMINALS}"
         flags = kernel.MS_NOSUID | kernel.MS_NOEXEC
@@ -247,7 +249,7 @@ def _mount_views(snapshot: str, packages: str) -> View:
     if packages:
         os.mkdir(f"{_SCRATCH}/packages", 0o755)
         _mount_copy_on_write(packages, f"{_SCRATCH}/packages", (f"{_SKELETON}/packages",), view)
-        # covered and not unmounted: the kernel would wait for all its readers, some milliseconds
+        # Covered, not unmounted: an unmount waits some milliseconds for all readers.
         os.mkdir(f"{_SCRATCH}/empty", 0o500)
         _bind(f"{_SCRATCH}/empty", _SKELETON)
     if snapshot in view.shared:
@@ -258,7 +260,7 @@ def _mount_views(snapshot: str, packages: str) -> View:
 
 
 def _mount_copy_on_write(path: str, upper: str, skeleton: Sequence[str], view: View) -> None:
-    """Mount an overlay on ``path`` whose writes go to ``upper``, or note why the host refuses."""
+    """Mount an overlay on ``path`` with ``upper`` for writes, or record why the host refuses."""
     below = os.open(path, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         mount_overlay(path, (*skeleton, path), upper)
@@ -270,8 +272,8 @@ def _mount_copy_on_write(path: str, upper: str, skeleton: Sequence[str], view: V
 
 
 def mount_overlay(path: str, lower: Sequence[str], upper: str) -> None:
-    """Over ``path`` the folders ``lower``, the first one on top; ``upper`` takes what is written.
-    Raises ``OSError``: there is no overlay in a user namespace before Linux 5.11, for example.
+    """Mount the folders ``lower`` over ``path``, the first one on top; writes go to ``upper``.
+    Raises ``OSError``: for example, Linux before 5.11 has no overlays in user namespaces.
     """
     inner = f"{upper}-inner"
     os.mkdir(inner, 0o700)
@@ -291,7 +293,7 @@ def _mount_links(snapshot: str) -> None:
 def _mirror_folders(source: str, target: str) -> None:
     """Make the folders of ``source`` again in ``target``, so that they belong to the jail's user.
 
-    Without recursion, which ``os.walk`` uses before Python 3.12: a stranger chose the depth.
+    It does not recurse, as ``os.walk`` does before Python 3.12: a stranger chose the depth.
     """
     waiting = [""]
     while waiting:

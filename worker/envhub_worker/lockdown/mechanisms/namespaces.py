@@ -34,7 +34,8 @@ def enter_user_namespace(uid: int, gid: int) -> None:
     """
     try:
         kernel.unshare(kernel.CLONE_NEWUSER)
-        # Without this the kernel refuses to write gid_map: a group may also take rights away.
+        # Without this the kernel refuses to write gid_map: to leave a group that takes rights away
+        # would add rights.
         _write("/proc/self/setgroups", "deny")
         _write("/proc/self/uid_map", f"{INSIDE_UID} {uid} 1")
         _write("/proc/self/gid_map", f"{INSIDE_UID} {gid} 1")
@@ -48,7 +49,9 @@ def _write(path: str, text: str) -> None:
 
 
 def mapped_to(user: int) -> int:
-    """Descriptor of a user namespace for mounts on which root's files are ``user``'s. As root."""
+    """Returns a descriptor of a user namespace for mounts that map root's files to ``user``. Needs
+    root.
+    """
     parent = os.getpid()
     pid = os.fork()
     if pid == 0:
@@ -67,14 +70,14 @@ def mapped_to(user: int) -> int:
 
 
 def unshare_for_zygote(network: str) -> None:
-    """What all jails of a zygote have in common: their ancestors' namespaces."""
+    """Enter the namespaces that all jails of a zygote share."""
     flags = kernel.CLONE_NEWNS | kernel.CLONE_NEWPID | kernel.CLONE_NEWIPC | kernel.CLONE_NEWUTS
     _unshare(flags | (0 if network == "host" else kernel.CLONE_NEWNET))
     socket.sethostname("sandbox")
 
 
 def unshare_for_jail(network: str) -> None:
-    """What each jail has for itself; ``fork_in_new_pid_namespace`` made its pid namespace."""
+    """Enter a jail's own namespaces, except the pid namespace, which its fork has made."""
     flags = kernel.CLONE_NEWNS | kernel.CLONE_NEWIPC | kernel.CLONE_NEWCGROUP
     _unshare(flags | (0 if network == "host" else kernel.CLONE_NEWNET))
 
@@ -102,9 +105,9 @@ def fork_in_new_pid_namespace() -> int:
 
 
 def forbid_what_is_counted() -> None:
-    """Set the kernel's limits on namespaces and file watches to 0 here, as a second barrier.
+    """Set this user namespace's limits on namespaces and file watches to 0, as a second barrier.
 
-    The kernel counts them per user in each user namespace and all above it, so a jail would take
+    The kernel counts them per user in each user namespace and in all above it, so a jail would take
     them from the user's other programs.
     """
     for name in os.listdir("/proc/sys/user"):
@@ -112,7 +115,7 @@ def forbid_what_is_counted() -> None:
 
 
 def shrink_tcp() -> None:
-    """Let what waits in a connection of our own network namespace stay below ``TCP_BUFFER``."""
+    """Limit the buffers of a connection in our own network namespace to ``TCP_BUFFER``."""
     for name in ("tcp_rmem", "tcp_wmem"):
         with contextlib.suppress(FileNotFoundError):
             _write(f"/proc/sys/net/ipv4/{name}", f"4096 65536 {TCP_BUFFER}")
@@ -130,8 +133,8 @@ def raise_loopback() -> None:
 def user_namespace_unavailable(
     error: OSError, read: Callable[[str], str | None] = procfs.text
 ) -> LayerUnavailableError:
-    """Why this host refused a user namespace, and what to do about it here.
-    ``read``: gives the text of a sysctl file, or None where there is none.
+    """Returns the error that says why this host refused a user namespace, and how to permit it.
+    ``read``: returns the text of a sysctl file, or None without that file.
     """
     reason, fix = _diagnosis(error, read)
     return LayerUnavailableError("user-namespace", reason, f"{fix} {_WEAKER}")
@@ -151,7 +154,7 @@ def _diagnosis(error: OSError, read: Callable[[str], str | None]) -> tuple[str, 
             "Install the AppArmor profile that `envhub doctor` prints, or run: "
             "sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0.",
         )
-    # the kernel says ENOSPC of namespaces, too, where there are too many already
+    # ENOSPC also means that there are too many namespaces already.
     short, _, cure = shortage(error, "here").partition(": ")
     if short and error.errno != errno.ENOSPC:
         return short, f"{cure.capitalize()}."

@@ -1,6 +1,6 @@
-"""What a process sets about itself: its parent's death, signals, descriptors, privileges.
+"""Settings of the calling process: signal at its parent's death, descriptors, privileges.
 
-A jail that keeps a capability remounts /usr writable, so all of them go.
+All capabilities are dropped: with a single one a jail could remount /usr writable.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _MAX_OPEN_FILES = 65_536
 
 
 def raise_file_limit() -> None:
-    """Open as many files as this user may: each runner takes a server some descriptors."""
+    """Raise the limit of open files to the hard limit: a server needs some for each runner."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _MAX_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, _MAX_OPEN_FILES)
     if 0 <= soft < wanted:
@@ -39,8 +39,8 @@ def raise_file_limit() -> None:
 def die_with_parent(parent: int, signum: int = signal.SIGKILL) -> None:
     """Receive ``signum`` when the parent thread ends; ``parent`` is its pid as we see it.
 
-    Arm again after every change of user: that clears it. A parent that has already gone sends
-    nothing, so that is checked after arming.
+    A change of user clears this setting: call again after each. A parent that has ended before the
+    call sends nothing, so this function checks for it afterwards.
     """
     kernel.prctl(_PR_SET_PDEATHSIG, signum)
     if os.getppid() != parent:
@@ -58,7 +58,7 @@ def become_subreaper() -> None:
 
 
 def set_no_new_privileges() -> None:
-    """Let no later ``execve`` gain anything: set-user-id bits and file capabilities are dead."""
+    """Keep every later ``execve`` from gaining privileges by set-user-id or file capabilities."""
     kernel.prctl(_PR_SET_NO_NEW_PRIVS, 1)
 
 
@@ -75,13 +75,13 @@ def drop_capabilities() -> None:
 
 
 def held_capabilities() -> int:
-    """Mask of what this thread has, may have or may pass on."""
+    """Returns the mask of all capabilities that this thread has, may have or may pass on."""
     effective, permitted, inheritable = kernel.capget()
     return effective | permitted | inheritable
 
 
 def empty_the_bounding_set() -> None:
-    """Let no later ``execve`` bring a capability in. Nothing happens without the right to."""
+    """Keep every later ``execve`` from adding capabilities. Does nothing without CAP_SETPCAP."""
     if not kernel.capget()[0] >> _CAP_SETPCAP & 1:
         return
     for capability in range(64):
@@ -94,7 +94,7 @@ def empty_the_bounding_set() -> None:
 
 
 def apply_limits(rules: Mapping[int, tuple[int, int]]) -> None:
-    """Set the (soft, hard) of each resource, never above the hard limit that already holds."""
+    """Set the (soft, hard) limits of each resource, never above the present hard limit."""
     for number, (soft, hard) in rules.items():
         ceiling = resource.getrlimit(number)[1]
         if ceiling != resource.RLIM_INFINITY:
@@ -124,8 +124,8 @@ def _close_range(low: int, high: int) -> None:
 
 
 def reset_signals(handled: Iterable[int]) -> None:
-    """Dispositions and mask as a Python program finds them after a plain exec.
-    ``handled``: the signals that this program has set a handler for. (Asking for all 64 costs more
+    """Set dispositions and mask to those of a Python program after a plain exec.
+    ``handled``: the signals that this program has set a handler for. (To ask for all 64 costs more
     than the rest of a fork.)
     """
     signal.set_wakeup_fd(-1)
@@ -135,12 +135,12 @@ def reset_signals(handled: Iterable[int]) -> None:
 
 
 def pid_of(pidfd: int) -> int:
-    """The pid behind ``pidfd`` as this process sees it; 0 or less when it has ended."""
+    """Returns the pid of ``pidfd`` as this process sees it; 0 or less after its end."""
     with open(f"/proc/self/fdinfo/{pidfd}") as file:
         return next(int(line.split()[1]) for line in file if line.startswith("Pid:"))
 
 
 def exit_fields(status: int) -> dict[str, int | None]:
-    """``{"code", "signal"}`` of a wait status; exactly one is not None."""
+    """Returns ``{"code", "signal"}`` of a wait status; exactly one of the two is not None."""
     code = os.waitstatus_to_exitcode(status)
     return {"code": code, "signal": None} if code >= 0 else {"code": None, "signal": -code}

@@ -1,4 +1,4 @@
-"""What the kernel says of processes: the one place that reads ``/proc/PID``."""
+"""Facts about processes from ``/proc/PID``, which only this module reads."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def pids() -> list[int]:
 
 
 def stat(pid: int) -> list[bytes]:
-    """The words of ``/proc/PID/stat`` (proc(5)) from the state on; raises OSError."""
+    """Returns the words of ``/proc/PID/stat`` (proc(5)) from the state on; raises OSError."""
     with open(f"/proc/{pid}/stat", "rb") as file:
         # The command may hold anything, parentheses and blanks included.
         return file.read().rpartition(b")")[2].split()
 
 
 def content(path: str) -> bytes:
-    """The content of a file of ``/proc``; empty when its process has gone."""
+    """Returns the content of a file of ``/proc``; empty if its process has ended."""
     try:
         with open(path, "rb") as file:
             return file.read()
@@ -32,14 +32,14 @@ def content(path: str) -> bytes:
 
 
 def text(path: str) -> str | None:
-    """The text of a small file, such as a setting; None if it cannot be read."""
+    """Returns the text of a small file, such as a setting; None if it cannot be read."""
     with contextlib.suppress(OSError), open(path, errors="replace") as file:
         return file.read(4096).strip()
     return None
 
 
 def numbers(path: str) -> dict[bytes, int]:
-    """The lines ``Name:   123 kB`` (then in bytes) and ``Name:   123``."""
+    """Parses the lines ``Name:   123 kB`` (converted to bytes) and ``Name:   123``."""
     values: dict[bytes, int] = {}
     for line in content(path).splitlines():
         words = line.split()
@@ -49,21 +49,21 @@ def numbers(path: str) -> dict[bytes, int]:
 
 
 def process_of(thread: int) -> int:
-    """The pid of the process that ``thread`` belongs to; 0 when it has gone."""
+    """Returns the pid of the process that ``thread`` belongs to; 0 if it has ended."""
     with contextlib.suppress(OSError):
         return numbers(f"/proc/{thread}/status").get(b"Tgid", 0)
     return 0
 
 
 def descriptors(pid: int) -> int:
-    """How many files a process has open; 0 where it has gone, or may not be looked at."""
+    """Returns how many files a process has open; 0 if it has ended or may not be inspected."""
     with contextlib.suppress(OSError):
         return len(os.listdir(f"/proc/{pid}/fd"))
     return 0
 
 
 def all_children() -> Children:
-    """The children of each process on this machine; takes some 0.1 ms a process."""
+    """Returns the children of each process on this machine; takes some 0.1 ms per process."""
     children: dict[int, list[int]] = {}
     for pid in pids():
         with contextlib.suppress(OSError):
@@ -74,8 +74,8 @@ def all_children() -> Children:
 def descendants(
     root: int, keep: Collection[int] = (), children: Children | None = None
 ) -> list[int]:
-    """Pids below ``root``, without those in ``keep`` and what is below them.
-    ``children``: what ``all_children`` gave a moment ago; looked up by default.
+    """Returns the pids below ``root``, without those in ``keep`` and their descendants.
+    ``children``: a recent result of ``all_children``; by default a new one.
     """
     children = all_children() if children is None else children
     pids: list[int] = []
@@ -88,7 +88,7 @@ def descendants(
 
 
 def is_below(pid: int, root: int) -> bool:
-    """Whether ``root`` is above ``pid``; also True of one that goes meanwhile."""
+    """Whether ``root`` is an ancestor of ``pid``; also True if ``pid`` ends meanwhile."""
     try:
         while pid > 1 and pid != root:
             pid = _parent(pid)

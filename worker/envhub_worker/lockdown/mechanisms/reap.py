@@ -1,4 +1,4 @@
-"""Ending every process below this one where no pid namespace does it for us."""
+"""Ends every process below this one if no pid namespace does so."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HANDLED = (signal.SIGCHLD, signal.SIGTERM)
 
 
 def child_signals(stop: Callable[..., None]) -> int:
-    """A descriptor that becomes readable when a child changes state, or SIGTERM comes."""
+    """Returns a descriptor that is readable when a child changes state or SIGTERM comes."""
     read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.signal(signal.SIGTERM, stop)
@@ -29,15 +29,15 @@ def child_signals(stop: Callable[..., None]) -> int:
 
 
 def drain(fd: int) -> None:
-    """Read whatever is in the non-blocking ``fd`` and drop it."""
+    """Read and drop everything in the non-blocking ``fd``."""
     with contextlib.suppress(BlockingIOError):
         while os.read(fd, 4096):
             pass
 
 
 def reap(before: Callable[[int], None] = lambda pid: None) -> Iterator[tuple[int, int]]:
-    """The pid and wait status of every child that has ended; orphans we adopted included.
-    ``before``: called with the pid while that still belongs to the dead child.
+    """Reaps every ended child, adopted orphans included; returns pids and wait statuses.
+    ``before``: called with each pid while that still belongs to the dead child.
     """
     with contextlib.suppress(ChildProcessError):
         while ended := os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT):
@@ -48,12 +48,12 @@ def reap(before: Callable[[int], None] = lambda pid: None) -> Iterator[tuple[int
 def kill_descendants(keep: Collection[int] = (), root: int | None = None) -> None:
     """SIGKILL everything below ``root`` (default: this process), daemons and fork bombs included.
 
-    All are stopped before any is killed, until none is new: a stopped process cannot fork away. But
-    one that is inside ``fork`` when it is stopped may finish that, and its child can appear after
-    the last look. So the end is a look that finds only what had ended before it began: whatever
-    lives then has a parent that this look would have found. ``root`` must adopt the orphans of its
-    descendants. However slow the machine is, those that are new are killed, too: what is stopped
-    counts as a process, so a limit on processes bounds how many appear.
+    All are stopped before any is killed, until no new process appears: a stopped process cannot
+    fork. But a process that is stopped inside ``fork`` may complete it, and its child can appear
+    after the last look. So this function ends with a look that finds only processes that had ended
+    before it began: a live process would have a parent that this look would find. ``root`` must
+    adopt the orphans of its descendants. On a slow machine new processes are killed, too: a stopped
+    process counts as one, so the limit on processes bounds how many appear.
     """
     root = os.getpid() if root is None else root
     deadline = 0.0
@@ -80,7 +80,7 @@ def _stop_below(root: int, keep: Collection[int]) -> set[int]:
 
 
 def _has_ended(pid: int) -> bool:
-    """Whether every thread has ended; ``/proc`` shows a zombie as soon as the first one has."""
+    """Whether every thread has ended: ``/proc`` shows a zombie once the first thread has ended."""
     try:
         pidfd = os.pidfd_open(pid)
     except OSError as error:

@@ -16,8 +16,8 @@ class Scratch:
     """Absolute paths of one jail's writable folders.
 
     Attributes:
-        work: The working directory: shows the snapshot's files, takes new ones.
-        shared_memory: Where ``shm_open`` puts its files, or None for nowhere.
+        work: The working directory: shows the snapshot's files and takes new ones.
+        shared_memory: The folder for files of ``shm_open``, or None.
     """
 
     home: str
@@ -27,12 +27,12 @@ class Scratch:
 
     @classmethod
     def in_namespace(cls) -> Scratch:
-        """The folders in a jail with its own mount namespace."""
+        """Returns the folders of a jail with its own mount namespace."""
         return cls(HOME, TEMPORARY, WORK, SHARED_MEMORY)
 
     @classmethod
     def on_host(cls, folder: str, shared_memory: str | None = None) -> Scratch:
-        """The folders that ``create`` makes in ``folder``."""
+        """Returns the folders that ``create`` makes in ``folder``."""
         return cls(f"{folder}/home", f"{folder}/tmp", f"{folder}/work", shared_memory)
 
     def create(self, snapshot: str, owner: int | None) -> None:
@@ -67,7 +67,7 @@ def remove_tree(path: str) -> None:
 
 
 def _empty(root: int) -> None:
-    # A name that the stranger could not foresee and put in the way.
+    # A random name: the stranger could not have made a file of that name.
     prefix, moved = f".{secrets.token_hex(8)}", 0
     os.fchmod(root, 0o700)
     pending = _unlink_files(root)

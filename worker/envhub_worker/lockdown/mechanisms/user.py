@@ -1,4 +1,4 @@
-"""Leaving root behind: a user that owns nothing and runs nothing."""
+"""Changes from root to a user that owns no file and runs no process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LOW = range(62000, 65000)
 
 
 def choose() -> int | None:
-    """The user that root's jails become; None for a plain user, who stays.
+    """Chooses the user that root's jails become; None if this process is not root.
     Raises ``LayerUnavailableError``: this root has no right to become another user.
     """
     if os.geteuid() != 0:
@@ -37,7 +37,7 @@ def choose() -> int | None:
 
 
 def unused_uid() -> int:
-    """A user id that is mapped here, has no name and runs no process.
+    """Finds a user id that is mapped here, has no name and runs no process.
     Raises ``LayerUnavailableError``: this user namespace maps too few users.
     """
     mapped = _mapped()
@@ -52,7 +52,7 @@ def unused_uid() -> int:
 
 
 def _mapped() -> tuple[int, int]:
-    """First and last id of the widest range that this user namespace maps."""
+    """Returns the first and last id of the widest range that this user namespace maps."""
     with open("/proc/self/uid_map") as file:
         ranges = [tuple(map(int, line.split())) for line in file]
     inside, _, length = max(ranges, key=itemgetter(2))
@@ -82,10 +82,10 @@ def _has_name(uid: int) -> bool:
 
 
 def become(uid: int) -> None:
-    """Become ``uid`` with that group only, for good. ``die_with_parent`` must be armed again."""
+    """Become ``uid`` with that group only, for good. Call ``die_with_parent`` again afterwards."""
     process.empty_the_bounding_set()
     os.setgroups([])
     os.setresgid(uid, uid, uid)
     os.setresuid(uid, uid, uid)
-    # The change made /proc/self root's; without this our user map could not be written.
+    # The change of user gave /proc/self to root; without this line we could not write our user map.
     process.set_dumpable(True)

@@ -27,7 +27,7 @@ class Label:
 
 @dataclass(frozen=True)
 class Do:
-    """``LOAD`` the word at offset ``k``, ``AND`` the accumulator with ``k``, or ``RETURN`` k."""
+    """An instruction: ``LOAD`` the word at offset ``k``, ``AND`` it with ``k``, or ``RETURN`` k."""
 
     code: int
     k: int
@@ -35,7 +35,7 @@ class Do:
 
 @dataclass(frozen=True)
 class Branch:
-    """Compare the accumulator with ``k``; None falls through."""
+    """A conditional jump that compares the accumulator with ``k``; a target None falls through."""
 
     code: int
     k: int
@@ -44,7 +44,7 @@ class Branch:
 
     @property
     def targets(self) -> list[str]:
-        """The labels that it names."""
+        """The labels that this branch jumps to."""
         return [target for target in (self.if_true, self.if_false) if target is not None]
 
 
@@ -81,12 +81,12 @@ def assemble(items: Sequence[Item]) -> list[BpfInstruction]:
 
 
 def _branch(item: Branch, following: int, labels: dict[str, int]) -> list[BpfInstruction]:
-    """The instructions of a branch; ``following`` is the number of instructions behind it."""
+    """Returns the instructions of a branch; ``following``: number of instructions after it."""
     skips = {end: following - labels[end] for end in item.targets}
     if max(skips.values(), default=0) <= 255:
         if_true, if_false = (skips.get(end or "", 0) for end in (item.if_true, item.if_false))
         return [BpfInstruction(item.code, if_true, if_false, item.k)]
-    # the comparison skips to one of up to two unconditional jumps, or over them
+    # The comparison jumps to one of up to two unconditional jumps, or over both.
     ends = item.targets
     skip_true = len(ends) if item.if_true is None else 0
     skip_false = len(ends) if item.if_false is None else len(ends) - 1
@@ -98,5 +98,5 @@ def _branch(item: Branch, following: int, labels: dict[str, int]) -> list[BpfIns
 
 
 def to_bytes(program: Sequence[BpfInstruction]) -> bytes:
-    """As the kernel reads it: an array of ``struct sock_filter``."""
+    """Returns the program as the kernel reads it: an array of ``struct sock_filter``."""
     return b"".join(struct.pack("=HBBI", i.code, i.if_true, i.if_false, i.k) for i in program)

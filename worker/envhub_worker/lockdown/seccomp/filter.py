@@ -1,4 +1,4 @@
-"""The system call filter: ``policy``'s table as a program, and its installation."""
+"""Compiles the table of ``policy`` to a BPF program and installs it as the system call filter."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from envhub_worker.lockdown.seccomp.policy import ByArguments, Check, Verdict
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 
 _AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
-# The x32 ABI reaches the same calls under numbers that a table does not list.
+# The x32 ABI reaches the same calls by other numbers, which no table lists.
 _X32 = 0x40000000
 
 _PR_GET_SECCOMP = 21
@@ -38,7 +38,7 @@ def compile_filter(
     scoped: bool = True,
     record: bool = False,
 ) -> bytes:
-    """This machine's program as bytes; see ``policy_table``; ``recorded_calls`` if ``record``.
+    """Compiles this machine's ``policy_table``, or its ``recorded_calls`` if ``record``, to bytes.
     Raises ``LayerUnavailableError``: no table for this machine.
     """
     machine = os.uname().machine
@@ -50,7 +50,9 @@ def compile_filter(
 
 
 def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.BpfInstruction]:
-    """Architecture first, then a balanced tree over the numbers, then the argument checks."""
+    """Returns the program: checks the architecture, then searches a balanced tree over the call
+    numbers, then checks arguments.
+    """
     if machine not in NUMBERS:
         raise no_system_calls(machine)
     numbers = NUMBERS[machine]
@@ -69,7 +71,7 @@ def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.BpfInstru
         _label(n, by_number.get(n, policy.EPERM if n in numbered else policy.ENOSYS))
         for n in range(highest + 1)
     ]
-    # (first number, label) of each run of equal labels
+    # A segment is a run of call numbers with equal labels: (first number, label).
     starts = [n for n, label in enumerate(labels) if n == 0 or labels[n - 1] != label]
     items += _tree([(n, labels[n]) for n in starts])
     for call, verdict in sorted(by_number.items()):
@@ -87,7 +89,7 @@ def _returning(verdict: int) -> str:
 
 
 def _tree(segments: list[tuple[int, str]]) -> list[Item]:
-    """Binary search for the segment of the loaded number."""
+    """Returns a binary search for the segment of the loaded call number."""
     middle = len(segments) // 2
     left, right = segments[:middle], segments[middle:]
     items: list[Item] = [
@@ -100,7 +102,7 @@ def _tree(segments: list[tuple[int, str]]) -> list[Item]:
 
 
 def _entry(segments: list[tuple[int, str]]) -> str:
-    """Where to go for these segments: the verdict of the only one, or their own sub-tree."""
+    """Returns the label for segments: the verdict of a single segment, or a subtree of several."""
     if len(segments) == 1:
         return segments[0][1]
     return f"tree-{segments[0][0]}-{segments[-1][0]}"
@@ -117,7 +119,7 @@ def _argument_block(label: str, verdict: ByArguments) -> list[Item]:
 
 
 def _compare(check: Check, otherwise: str) -> list[Item]:
-    """Fall through when the check holds. Both machines are little-endian."""
+    """Returns a check that falls through if it holds. Both machines are little-endian."""
     offset = _ARGUMENTS + 8 * check.arg
     items: list[Item] = [Do(bpf.LOAD, offset)]
     if check.mask != 0xFFFFFFFF:
@@ -130,7 +132,7 @@ def _compare(check: Check, otherwise: str) -> list[Item]:
 
 
 def _returns(items: list[Item]) -> list[Item]:
-    """A labelled return for each verdict that is a branch's target."""
+    """Returns a labelled return for each verdict that a branch jumps to."""
     targets = {
         target
         for item in items
@@ -152,7 +154,8 @@ class _Program(ctypes.Structure):
 def install(compiled: bytes, *, brokered: bool = False) -> int:
     """Filter this thread and its descendants for good. ``no_new_privs`` must be set.
 
-    Returns where the calls that ask arrive if ``brokered``, else -1. Its holder decides.
+    Returns, if ``brokered``, the listener: the descriptor at which notified calls arrive and whose
+    holder decides them. Otherwise returns -1.
     Raises ``LayerUnavailableError``: the kernel refuses.
     """
     code = ctypes.create_string_buffer(compiled, len(compiled))
@@ -172,10 +175,10 @@ def install(compiled: bytes, *, brokered: bool = False) -> int:
 
 
 def _listener(index: int) -> int:
-    """Install the program at ``index``, so that no signal interrupts a call that waits for init.
+    """Install the program at ``index``; no signal interrupts a call that waits for init.
 
-    Kernels before 5.19 lack the flag for that: there a signal ends the call with EINTR, or makes
-    it ask again if the signal's handler restarts calls.
+    Kernels before 5.19 lack the flag for that: there a signal ends the call with EINTR, or repeats
+    the notification if the signal's handler restarts calls.
     """
     try:
         return kernel.syscall("seccomp", _SET_MODE_FILTER, _NEW_LISTENER | WAIT_KILLABLE, index)

@@ -1,11 +1,11 @@
-"""Init's answers to calls that the filter hands over: signals, and calls that are recorded.
+"""Init answers the calls that the filter hands to it: signals, and recorded calls.
 
 In a jail without a pid namespace, where Landlock cannot scope signals (before ABI 6), the filter
-hands ``kill``, ``tkill`` and ``tgkill`` to init, which sends the signal when the
-target is a process of the jail. All of their arguments are numbers in registers, so nothing can
-change between the check and the act; a target is held by a pidfd before it is looked at, so no
-other process can take its pid. The kernel goes on with what a process sends to itself:
-sent by init, it would interrupt the very call that waits for the answer.
+hands ``kill``, ``tkill`` and ``tgkill`` to init, which sends the signal if the target is a process
+of the jail. Their arguments are numbers in registers, so none can change between check and use.
+Init opens a pidfd of the target before it checks it, so no other process can take over the pid. The
+kernel itself delivers signals of a process to itself: a signal from init would interrupt the very
+call that waits for init's answer.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ class Request:
 
     Attributes:
         thread: The calling thread.
-        caller: Its process; 0 if it has gone.
-        call: Its name.
-        words: Its six arguments, as the registers are.
-        still_waits: Raises OSError where the caller has gone since.
+        caller: The thread's process; 0 if it has ended.
+        call: The name of the system call.
+        words: Its six arguments, as in the registers.
+        still_waits: Raises OSError if the caller has ended since.
     """
 
     thread: int
@@ -58,7 +58,7 @@ class Request:
 
     @property
     def arguments(self) -> list[int]:
-        """The first three words, as the C integers that the kernel reads."""
+        """The first three arguments as C integers, as the kernel reads them."""
         return [c_int(word) for word in self.words[:3]]
 
 
@@ -72,17 +72,17 @@ _NETLINKS = (0, 15)
 
 
 def serve(listener: int, permitted: Collection[str], note: Callable[[Request], None]) -> bool:
-    """Answer one request that waits at ``listener``; False when no caller is left.
+    """Answer one request that waits at ``listener``; returns False if no caller is left.
 
-    The kernel goes on with the calls of ``permitted``, which the policy allows whatever their
-    arguments: they only ask to be seen. What is neither one of these nor a signal is denied, and
-    so is what sets attributes.
+    The kernel continues the calls of ``permitted``, which the policy allows with any arguments and
+    which init only records. All other calls except signals are denied, and so are calls that set
+    attributes.
     """
     buffer = bytearray(_REQUEST.size)
     try:
         fcntl.ioctl(listener, _RECEIVE, buffer)
     except OSError as error:
-        # Something took the caller out of its call; others may still come.
+        # A signal took the caller out of its call; other callers may still come.
         return error.errno == errno.EINTR or _has_callers(listener)
     identity, thread, _, number, _, _, *words = _REQUEST.unpack(buffer)
 
@@ -110,12 +110,12 @@ flood of one kind hides no attempt of another."""
 
 
 def kind(detail: str) -> str:
-    """The kind of what was denied, by its detail."""
+    """Returns the kind of a denied call, by its detail."""
     return next((begin for begin in ("/", "AF_") if detail.startswith(begin)), "")
 
 
 def detail(request: Request) -> str:
-    """The scalar arguments that are safe to report, such as the family of a socket."""
+    """Returns the scalar arguments that are safe to report, such as the family of a socket."""
     call = request.call
     if call in NAMING and is_another_target(call, request.arguments, request.caller, os.getpid()):
         return OTHER
@@ -131,7 +131,7 @@ def detail(request: Request) -> str:
 
 
 def is_own_affair(call: str, permitted: Collection[str]) -> bool:
-    """Whether a call is no attempt at anything, where it is about the jail's own processes."""
+    """Whether a call that targets the jail's own processes is nothing to report."""
     return call in permitted or call in PRETENDED or call in _SIGNALS
 
 
@@ -142,9 +142,8 @@ def _has_callers(listener: int) -> bool:
 
 
 def decide(request: Request, inside: _Inside) -> int:
-    """Send the signal that ``request`` asks for, where that is permitted; 0, an errno, or
-    ``_PROCEED``.
-    ``inside``: gives the pids of the jail's processes, without init.
+    """Send the signal of a request if it is permitted. Returns 0, an errno, or ``_PROCEED``.
+    ``inside``: returns the pids of the jail's processes, without init.
     """
     first, second, third = request.arguments
     if request.caller == 0:
@@ -164,7 +163,7 @@ def _kill(caller: int, target: int, signum: int, inside: _Inside) -> int:
     group = _group_of(caller)
     if group < 0:
         return errno.ESRCH  # it has gone since: no caller waits for the answer
-    # A process is alone with the jail in its own group: the host has a session of its own.
+    # A process group of a jail holds its processes only, for the jail has its own session.
     if target in (caller, 0, -group):
         return _PROCEED
     if target == -1:
@@ -192,7 +191,8 @@ def _send_to_thread(pid: int, thread: int, signum: int, inside: _Inside) -> int:
 
 
 def _held(pid: int, inside: _Inside, act: Callable[[int], object]) -> int:
-    """``act`` on the pidfd of ``pid`` if that is a process of the jail; 0 or an errno."""
+    """Call ``act`` with a pidfd of ``pid`` if that is in the jail. Returns 0 or an errno."""
+    # In this order: the pidfd pins the pid to one process, and only then is it checked.
     try:
         pidfd = os.pidfd_open(pid)
     except OSError as error:

@@ -1,9 +1,8 @@
-"""Which system calls a jail may make: a table per profile. Pure.
+"""The system calls that a jail may make: a table for each profile. Pure.
 
-An allow-list: a call that the kernel headers of ``syscalls`` name and that is not here answers
-EPERM; one that they do not name answers ENOSYS, so that programs fall back. What is here some
-library asks for: ``python -m tests.field`` runs the packages of the field, and says which calls
-they make.
+The table is an allow-list. A call that ``syscalls`` knows but the table lacks fails with EPERM; an
+unknown call fails with ENOSYS, so that programs fall back. Some library needs each call here:
+``python -m tests.field`` runs the packages of the field and reports their calls.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from envhub_worker.protocol.records import dataclass
 _ERRNO = 0x00050000
 ALLOW = 0x7FFF0000
 KILL_PROCESS = 0x80000000
-#: Somebody outside of the filter answers (``SECCOMP_RET_USER_NOTIF``).
+#: Init answers the call (``SECCOMP_RET_USER_NOTIF``).
 ASK = 0x7FC00000
 EPERM = _ERRNO | errno.EPERM
 ENOSYS = _ERRNO | errno.ENOSYS
 EINVAL = _ERRNO | errno.EINVAL
-#: Says that it worked and does nothing: libraries abort, or give up a copy, over an error.
+#: The call does nothing and succeeds: an error would make libraries abort, or give up a copy.
 PRETEND = _ERRNO | 0
 
 
@@ -79,23 +78,23 @@ _CONNECTED_SOCKETS = """
     getsockname getpeername sendmsg sendmmsg recvfrom recvmsg recvmmsg getsockopt shutdown
 """
 _OTHER_SOCKETS = "bind listen accept accept4 connect"
-# These reach beyond what Landlock guards, so they need a mount and an IPC namespace.
+# Landlock does not restrict these, so they need a mount and an IPC namespace.
 _MODES_AND_TIMES = "chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat utimensat"
 _NAMESPACED = f"""
     {_MODES_AND_TIMES} sched_setaffinity removexattr lremovexattr fremovexattr
 """
-#: These answer as on a file system without attributes. Access lists are kernel memory, 128 KiB a
-#: file, that no control group counts; programs that copy a file go on without them.
+#: These fail as on a file system without attributes. Access lists take 128 KiB of kernel memory per
+#: file, which no control group counts; programs that copy a file work without them.
 WITHOUT_ATTRIBUTES = frozenset(("setxattr", "lsetxattr", "fsetxattr"))
 # These succeed and do nothing: a jail has one user, libzmq aborts if it cannot set the scheduler,
-# and syncing stalls the host's disks. The last three are what there was before utimensat.
+# and syncing stalls the host's disks. The last three are the predecessors of utimensat.
 _WITHOUT_EFFECT = """
     setuid setgid setreuid setregid setresuid setresgid sched_setscheduler sched_setparam
     sched_setattr sync syncfs sync_file_range readahead utime utimes futimesat
 """
-# Programs fall back from these, for other kernels do not have them. The first three lines are
-# memory of the kernel's own, counted per user if at all (watches of files also tell what others
-# open). Memory policies, mbind, are not in the table either.
+# Programs work without these, which some kernels lack. The first three lines take kernel memory
+# that is counted per user or not at all (watches of files also tell which files others open).
+# Memory policies (mbind) are not in the table either.
 _ABSENT = """
     inotify_init inotify_init1 inotify_add_watch inotify_rm_watch
     semget semop semtimedop semctl msgget msgsnd msgrcv msgctl shmget shmat shmctl shmdt
@@ -104,7 +103,7 @@ _ABSENT = """
     pkey_alloc pkey_free pkey_mprotect futex_waitv futex_wake futex_wait futex_requeue
 """
 
-#: Below it shared memory without a name may be made where init measures memory.
+#: Maximum size of shared memory without a name if init measures memory.
 SHARED_BYTES = 1 << 20
 
 _NAMESPACES = 0x7E020000  # every CLONE_NEW* that clone takes
@@ -118,23 +117,23 @@ _ENOMEM = _ERRNO | errno.ENOMEM
 _ENOTSUP = _ERRNO | errno.ENOTSUP
 _TIOCSTI, _TIOCLINUX, _TIOCCONS, _TIOCSETD = 0x5412, 0x541C, 0x541D, 0x5423
 _FIOSETOWN, _SIOCSPGRP = 0x8901, 0x8902
-# Duplicates, flags, locks, whose signals they are, the size of a pipe, seals, hints to be read.
+# Operations of fcntl: duplicates, flags, locks, signal owners, pipe sizes, seals, reading hints.
 _FCNTLS = (*range(8), 9, 11, 16, 36, 37, 38, 1025, 1027, 1028, 1030, 1032, 1033, 1034, 1035, 1037)
 _F_SETOWN, _F_SETSIG, _F_SETOWN_EX, _F_SETLEASE, _F_NOTIFY = 8, 10, 15, 1024, 1026
 _F_SETPIPE_SZ, _F_SET_RW_HINT, _F_SET_FILE_RW_HINT, _F_SETDELEG = 1031, 1036, 1038, 1040
 _MAP_SHARED, _MAP_ANONYMOUS, _MAP_HUGETLB = 0x1, 0x20, 0x40000
-# Huge pages that the administrator set aside are in no process's account.
+# No process's memory count includes reserved huge pages (MAP_HUGETLB).
 _HUGE = (((Check(3, _MAP_HUGETLB, _MAP_HUGETLB),), _ENOMEM),)
 _SOL_SOCKET = 1
 _SO_SNDBUF, _SO_RCVBUF, _SO_SNDBUFFORCE, _SO_RCVBUFFORCE = 7, 8, 32, 33
 _SO_ATTACH_FILTER, _SO_ATTACH_BPF, _SO_ATTACH_CBPF, _SO_ATTACH_EBPF = 26, 50, 51, 52
-# PR_SET_PDEATHSIG, _NAME, _TIMERSLACK, _CHILD_SUBREAPER and _NO_NEW_PRIVS, and what only reads.
+# PR_SET_PDEATHSIG, _NAME, _TIMERSLACK, _CHILD_SUBREAPER and _NO_NEW_PRIVS, and reading options.
 _PRCTLS = (1, 2, 3, 15, 16, 21, 23, 27, 29, 30, 36, 37, 38, 39, 42, 51, 52, 56, 64)
-# PR_SET_DUMPABLE (init must be able to measure), _SECCOMP (filters are memory in no account), _MM,
-# _SYSCALL_USER_DISPATCH, and capabilities. An option of neither list answers EINVAL, as an unknown
-# one does.
+# Denied: PR_SET_DUMPABLE (init must be able to measure), _SECCOMP (nobody counts the memory of
+# filters), _MM, _SYSCALL_USER_DISPATCH, and capabilities. An option in neither list fails with
+# EINVAL, like an unknown option.
 _PR_DENIED = (4, 8, 22, 24, 28, 35, 47, 59)
-# Segment bases, with which threads are made, and the registers for matrices: torch asks for them.
+# arch_prctl: segment bases, which new threads need, and matrix registers (AMX), which torch uses.
 _ARCH_PRCTLS = (0x1001, 0x1002, 0x1003, 0x1004, 0x1021, 0x1022, 0x1023)
 
 
@@ -146,7 +145,7 @@ def policy_table(
     measured: bool = False,
     scoped: bool = True,
 ) -> dict[str, Verdict]:
-    """System call to verdict; what is missing is denied.
+    """Returns the verdict of each system call; missing calls are denied.
 
     Args:
         namespaced: A mount, pid and IPC namespace hold the jail, so that paths, processes and
@@ -174,12 +173,12 @@ def policy_table(
 
 
 def recorded_calls(verdicts: Mapping[str, Verdict], names: Iterable[str]) -> dict[str, Verdict]:
-    """The same, where init answers what is denied, and so knows that it was tried.
+    """Returns a table in which init answers denied calls, so that it can record them.
 
-    What is not there at all (ENOSYS), or only seems to work, is no attempt at anything: libraries
-    ask for it on their way to something else. What names files is seen on its way to the kernel,
-    and so is what names a process, which may be another's.
-    ``names``: every call that there is.
+    Calls that fail with ENOSYS, or that do nothing, are not recorded: libraries merely probe for
+    them. Calls that name files or processes, which may belong to others, pass through init on their
+    way to the kernel.
+    ``names``: all system calls.
     """
     denied = {name: _asking(name, verdicts.get(name, EPERM)) for name in names}
     seen: dict[str, Verdict] = dict.fromkeys(watched_calls(verdicts), ASK)
@@ -189,10 +188,10 @@ def recorded_calls(verdicts: Mapping[str, Verdict], names: Iterable[str]) -> dic
 
 
 def watched_calls(verdicts: Mapping[str, Verdict]) -> frozenset[str]:
-    """What names files and processes, and is denied for no file's or process's sake.
+    """Returns permitted calls that name files or processes.
 
-    Init lets the kernel go on, but for ``WITHOUT_ATTRIBUTES``. Not so where arguments decide: the
-    kernel would make the call without looking at them again.
+    Init lets the kernel continue them, except ``WITHOUT_ATTRIBUTES``. Calls that the filter decides
+    by arguments are left out: the kernel would continue them without that check.
     """
     seen = (ALLOW, _ENOTSUP)
     return frozenset(name for name in (*NAMED, *NAMING) if verdicts.get(name) in seen)
@@ -207,7 +206,7 @@ def _asking(name: str, verdict: Verdict) -> Verdict:
 
 
 def refusal(call: str) -> int:
-    """The errno with which a call that is denied answers; 0: it seems to work."""
+    """Returns the errno of a denied call; 0 if it seems to succeed."""
     if call in PRETENDED:
         return 0
     if call in WITHOUT_ATTRIBUTES:
@@ -216,18 +215,18 @@ def refusal(call: str) -> int:
 
 
 def _filtered() -> dict[str, Verdict]:
-    """Calls whose arguments decide, under every profile."""
+    """Returns the calls that are decided by their arguments under every profile."""
     own = ((Check(0, 0), Check(1, 0)), ALLOW)
     return {
         "clone": ByArguments((((Check(0, 0, _NAMESPACES),), ALLOW),), EPERM),
-        # Its flags lie in memory, where a filter cannot look; the C library falls back.
+        # clone3 has its flags in memory, which a filter cannot read; the C library falls back.
         "clone3": ENOSYS,
         "prctl": _by_option(0, _PRCTLS, _PR_DENIED),
         "arch_prctl": _by_option(0, _ARCH_PRCTLS),
         "prlimit64": ByArguments((((Check(0, 0),), ALLOW),), EPERM),
         "setpriority": ByArguments((own,), EPERM),
         "ioprio_set": EPERM,
-        # A fifo; in this way libraries make no other file.
+        # Fifos only: libraries make no other file by mknod.
         "mknod": ByArguments((((Check(1, _S_IFIFO, _S_IFMT),), ALLOW),), EPERM),
         "mknodat": ByArguments((((Check(2, _S_IFIFO, _S_IFMT),), ALLOW),), EPERM),
         "ioctl": _ioctls(),
@@ -240,9 +239,10 @@ def _filtered() -> dict[str, Verdict]:
 def _fcntls() -> ByArguments:
     """Deny operations that affect other processes through a file that is open for reading.
 
-    A lease on a file, or a delegation of a folder, makes everybody wait who opens it. Notices tell
-    what others do in a folder. The kernel sends signals to a file's owner. Pages of pipes are
-    counted per user: a few large pipes would leave only tiny ones to the user's other programs.
+    A lease on a file, or a delegation of a folder, blocks other processes that open it.
+    Notifications tell what others do in a folder. Owner operations make the kernel send signals.
+    Pipe pages are counted per user: a few large pipes would leave tiny ones to the user's other
+    programs.
     """
     owners = (_F_SETOWN, _F_SETSIG, _F_SETOWN_EX)
     others = (_F_SETPIPE_SZ, _F_SET_RW_HINT, _F_SET_FILE_RW_HINT)
@@ -251,13 +251,15 @@ def _fcntls() -> ByArguments:
 
 
 def _by_option(arg: int, allowed: Iterable[int], denied: Iterable[int] = ()) -> ByArguments:
-    """Decide by the option in argument ``arg``; one in neither list answers EINVAL."""
+    """Decides by the option in argument ``arg``; an option in neither list fails with EINVAL."""
     rules = [((Check(arg, option),), ALLOW) for option in allowed]
     return ByArguments((*rules, *(((Check(arg, option),), EPERM) for option in denied)), EINVAL)
 
 
 def _socket_options() -> ByArguments:
-    """Pretend to resize buffers, whose default size init counts; deny filters: kernel memory."""
+    """Ignores new buffer sizes, since init counts the default, and denies filters, since they take
+    kernel memory.
+    """
 
     def rules(verdict: int, *options: int) -> Rules:
         return tuple(((Check(1, _SOL_SOCKET), Check(2, option)), verdict) for option in options)
@@ -268,7 +270,7 @@ def _socket_options() -> ByArguments:
 
 
 def _unmeasurable() -> dict[str, Verdict]:
-    """Deny memory that init cannot find, because no process has it open or mapped.
+    """Denies memory that init cannot see because no process has it open or mapped.
 
     A memfd can wait in a socket, and shared memory keeps all pages while one of them is mapped.
     Programs fall back to files in the scratch, whose size is bounded.
@@ -280,7 +282,7 @@ def _unmeasurable() -> dict[str, Verdict]:
 
 
 def _ioctls() -> ByArguments:
-    # File systems' own calls, which Landlock does not see: 'f', 'v' and 'X' change flags,
+    # File systems' own ioctls, which Landlock does not check: 'f', 'v' and 'X' change flags,
     # versions, encryption and verity of a file that is open for reading, 0x94 (btrfs) and 0xf5
     # (f2fs) also volumes.
     kinds = (ord("f"), ord("v"), ord("X"), 0x94, 0xF5)
@@ -291,10 +293,10 @@ def _ioctls() -> ByArguments:
 
 
 def _sockets(local: bool, network: str, *, own: bool) -> dict[str, Verdict]:
-    """Verdicts for sockets.
+    """Returns the verdicts for socket calls.
 
-    ``local``: sockets may have names in the file system, as no other process has such names.
-    ``own``: the jail has a network namespace of its own, which its user namespace owns.
+    ``local``: sockets may have names in the file system, where only the jail's processes have any.
+    ``own``: the jail has a network namespace, which its user namespace owns.
     """
     internet = network != "none"
     verdicts: dict[str, Verdict] = {
@@ -310,9 +312,9 @@ def _sockets(local: bool, network: str, *, own: bool) -> dict[str, Verdict]:
 def _families(local: bool, internet: bool, own: bool) -> Rules:
     rules: list[tuple[tuple[Check, ...], int]] = []
     if own:
-        # Programs list their network devices, and SDL's games die where they cannot wait for new
-        # input devices. There are none but lo, nothing of it can be changed without a capability,
-        # and the kernel tells its events of devices to no user namespace but the first.
+        # Netlink: programs list network devices, and SDL's games exit if they cannot wait for new
+        # input devices. The jail has only lo, cannot change it without a capability, and the kernel
+        # sends device events to the first user namespace only.
         for kind in (_SOCK_DGRAM, _SOCK_RAW):
             for protocol in (_NETLINK_ROUTE, _NETLINK_KOBJECT_UEVENT):
                 checks = (Check(0, _AF_NETLINK), Check(1, kind, _SOCK_TYPE), Check(2, protocol))
@@ -336,7 +338,8 @@ def _pairs(local: bool) -> Rules:
 
 
 def _without_namespaces() -> dict[str, Verdict]:
-    # What touches a path takes a success for a file that is there, and does not create it.
+    # A program that touches a path takes a success to mean that the file exists, and does not
+    # create it. So only calls on a descriptor (no path) pretend to succeed.
     touched = ((Check(1, 0, wide=True),), PRETEND), ((Check(2, 0, wide=True),), EPERM)
     return {
         **dict.fromkeys(_MODES_AND_TIMES.split(), PRETEND),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 
-# In the order of their numbers, from 0; "-" is a number that the architecture does not use.
+# Names in the order of their numbers, from 0; "-" marks an unused number.
 _X86_64 = """
     read write open close stat fstat lstat poll lseek mmap mprotect munmap brk rt_sigaction
     rt_sigprocmask rt_sigreturn ioctl pread64 pwrite64 readv writev access pipe select
@@ -81,7 +81,7 @@ _AARCH64 = """
     mlock2 copy_file_range preadv2 pwritev2 pkey_mprotect pkey_alloc pkey_free statx
     io_pgetevents rseq kexec_file_load
 """
-# From 424 on every architecture counts alike.
+# From 424 on the numbers are the same on every architecture.
 _COMMON_FROM = 424
 _COMMON = """
     pidfd_send_signal io_uring_setup io_uring_enter io_uring_register open_tree move_mount
@@ -101,12 +101,12 @@ def _numbered(names: str) -> dict[str, int]:
     return table | {name: _COMMON_FROM + n for n, name in enumerate(_COMMON.split())}
 
 
-#: Machine (as ``os.uname`` says it) to name to number.
+#: Call numbers by machine (as in ``os.uname``) and name.
 NUMBERS = {"x86_64": _numbered(_X86_64), "aarch64": _numbered(_AARCH64)}
 
 _Where = tuple[tuple[int | None, int], ...]
 
-# Where the descriptor of a folder is among a call's arguments (None: there is none), and the path.
+# Argument positions of a call's folder descriptor (or None), and of its path.
 _AT: _Where = ((0, 1),)
 _PLAIN: _Where = ((None, 0),)
 _TWO_AT: _Where = ((0, 1), (2, 3))
@@ -121,15 +121,15 @@ _CALLS: tuple[tuple[str, _Where], ...] = (
     ("symlinkat", ((1, 2),)),
     ("connect sendto", ()),
 )
-#: What opens and changes files by name.
+#: Calls that open or change files by name.
 NAMED: dict[str, _Where] = {name: where for names, where in _CALLS for name in names.split()}
 
 _PRETENDED = "sched_setscheduler sched_setparam sched_setattr sched_setaffinity"
 WHICH = {"setpriority": 0, "ioprio_set": 1}  # and what says there that a process is meant
 SIGNUM = {"kill": 1, "tkill": 1, "tgkill": 2, "rt_sigqueueinfo": 1, "rt_tgsigqueueinfo": 2}
-#: What does nothing and says that it worked, where it is not permitted.
+#: Calls that do nothing and succeed where they are not permitted.
 PRETENDED = frozenset(_PRETENDED.split())
-#: Calls that name a process, and which of their arguments does.
+#: Calls that name a process, and the position of that argument.
 NAMING = dict.fromkeys((*SIGNUM, "pidfd_open", *PRETENDED), 0) | dict.fromkeys(WHICH, 1)
 
 

@@ -1,4 +1,4 @@
-"""Which calls are about a process outside of the caller's jail."""
+"""Decides whether a system call targets a process outside of the caller's jail."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ENTRY = re.compile(r"/proc/(\d{1,18})(/.*)?", re.DOTALL)
 
 
 def is_another_target(call: str, arguments: Sequence[int], caller: int, init: int) -> bool:
-    """Whether a call, one of ``NAMING``, is about a process outside of its jail, as its init is.
+    """Whether a call of ``NAMING`` targets a process outside of the jail, such as the jail's init.
     ``arguments``: the first three, as C integers.
     """
     if call in WHICH and arguments[0] != WHICH[call]:
@@ -36,7 +36,7 @@ def is_another_target(call: str, arguments: Sequence[int], caller: int, init: in
 
 
 def never_a_target(path: str) -> bool:
-    """Whether a path is below ``/proc/N`` of a process that the jail cannot have met."""
+    """Whether a path is below ``/proc/N`` of a process that the jail cannot know."""
     entry = _ENTRY.fullmatch(path)
     return entry is not None and _never_was(int(entry[1]))
 

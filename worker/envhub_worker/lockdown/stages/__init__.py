@@ -1,1 +1,1 @@
-"""Who locks what down, and when: zygote, jail, runner, and the test at the end."""
+"""The stages of lockdown in order: zygote, jail (its init), runner with its self-test."""

@@ -1,4 +1,4 @@
-"""A jail's own confinement, by its init: what all runners of the jail have in common."""
+"""The jail's stage of lockdown: init applies the confinement that all its runners share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from envhub_worker.protocol.confinement import Limits
 
 
 def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, View]:
-    """Confine this init as far as all of its runners are. Gives the jail's folders and its view.
+    """Apply to this init the confinement that its runners share. Returns the jail's folders and
+    view.
     Raises ``LayerUnavailableError``: the host lacks a layer that the profile names.
     ``folder``: a private folder of the host for a jail without a mount namespace.
     """
@@ -106,7 +107,7 @@ def _has_content(folder: str) -> bool:
 
 
 def working_view(view: View) -> Layer:
-    """How a jail sees what it shares with others, for its report."""
+    """Returns the layer, for the report, that says how a jail sees shared files."""
     detail = "the repository and its packages, copy on write: changes go to the scratch"
     if view.refused:
         path, why = next(iter(view.refused.items()))
@@ -126,7 +127,7 @@ def _check_readable(spec: JailSpec) -> None:
 
 
 def process_limit(limits: Limits, namespaced: bool) -> int:
-    """``RLIMIT_NPROC`` of a runner: it counts all of the user's threads in the user namespace."""
+    """Returns a runner's ``RLIMIT_NPROC``; it counts the user's threads in the user namespace."""
     if namespaced:
         return limits.processes + 1  # init
     return limits.processes + _threads_of(os.getuid())
@@ -148,5 +149,5 @@ def _leave_the_zygote() -> None:
     process.drop_capabilities()
     process.set_no_new_privileges()
     process.set_dumpable(False)
-    # The change of credentials disarmed it.
+    # The change of credentials has cleared the parent-death signal.
     process.die_with_parent(0, signal.SIGKILL)

@@ -1,6 +1,8 @@
-"""A runner's own confinement: what the kernel binds to one process and its descendants.
+"""The runner's stage of lockdown: confinement that the kernel binds to a process and its
+descendants.
 
-At the end it tries what it must not be able to do: the last thing before a stranger's code.
+It ends with a self-test, the last step before a stranger's code: the runner tries everything that
+it must not be able to do.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from envhub_worker.lockdown.root_plan import TERMINALS
 from envhub_worker.lockdown.seccomp import filter
 from envhub_worker.protocol.confinement import Limits
 
-# What the C library and numerical libraries read; nothing here is about a person.
+# Files that the C library and numerical libraries read. None of them tells about a person.
 _HOST_FILES = (
     "/etc/alternatives",
     "/etc/fonts",
@@ -45,8 +47,8 @@ _HOST_FILES = (
     "/proc/uptime",
     "/proc/version",
 )
-# Of a process's own folder in /proc. Not net, nor task, below which it lies again: without a
-# network namespace it lists the connections, neighbours and socket files of the whole host.
+# Readable entries of a process's own folder in /proc. net is missing, and task, which contains net:
+# without a network namespace net lists the connections, neighbours and socket files of the host.
 _OWN_FILES = """
     auxv cgroup cmdline comm environ fd fdinfo io limits maps mem mountinfo mounts oom_score
     oom_score_adj smaps smaps_rollup stat statm status
@@ -99,8 +101,8 @@ def enter(
 
 
 def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
-    """What Landlock permits a runner; everything else it denies.
-    ``pid``: the runner's own: without a pid namespace it may read only its own ``/proc`` folder.
+    """Returns the Landlock rules of a runner; everything else is denied.
+    ``pid``: the runner's pid; without a pid namespace it may read only its own ``/proc`` folder.
     """
     common = jail.common
     readable = [*common.root.trees, jail.spec.snapshot]
@@ -108,8 +110,9 @@ def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
     own_files = [f"{own}/{name}" for name in _OWN_FILES.split()]
     readable += ["/proc", "/etc", "/dev"] if common.namespaced else [*_HOST_FILES, *own_files]
     writable = _writable(jail)
-    # CUDA names its threads there, and gives up (error 304) where it cannot. Nobody else's
-    # processes are in a pid namespace's /proc; without one, children cannot name theirs.
+    # CUDA writes thread names there and fails (error 304) if it cannot. With a pid namespace, /proc
+    # has the jail's processes only. Without one the runner may write below its own folder only, so
+    # child processes cannot name their threads.
     devices = [*common.root.devices, *([TERMINALS] if common.namespaced else [])]
     threads = (
         [] if common.config.gpu is False else ["/proc" if common.namespaced else f"{own}/task"]
@@ -130,7 +133,7 @@ def _writable(jail: JailContext) -> list[str]:
 
 
 def runner_paths(jail: JailContext, pid: int, thread: int) -> OwnPaths:
-    """What a process may change and read, by the names that it has for it."""
+    """Returns the paths that a process may change and read, under the names that it sees."""
     streams = ("/dev/fd", "/dev/stdin", "/dev/stdout", "/dev/stderr")
     itself = ("/proc/self", "/proc/thread-self", f"/proc/{pid}", f"/proc/{thread}")
     scratch = tuple(_writable(jail))
@@ -141,8 +144,8 @@ def runner_paths(jail: JailContext, pid: int, thread: int) -> OwnPaths:
 
 
 def resource_limits(limits: Limits, processes: int | None) -> dict[int, tuple[int, int]]:
-    """Resource number to (soft, hard).
-    ``processes``: cap for ``RLIMIT_NPROC``, or None where it would count strangers.
+    """Returns the (soft, hard) limits by resource number.
+    ``processes``: cap for ``RLIMIT_NPROC``, or None if it would count other programs' threads.
     """
     file_bytes = limits.disk_bytes if limits.file_bytes is None else limits.file_bytes
     rules = {
@@ -163,7 +166,7 @@ def resource_limits(limits: Limits, processes: int | None) -> dict[int, tuple[in
 
 
 def _self_test(jail: JailContext, descriptors: Iterable[int]) -> None:
-    """Try everything that a runner must not be able to do and that does no harm.
+    """Try every harmless action that a runner must not be able to do.
     Raises ``LayerUnavailableError``: layer ``self-test``: a denial does not hold.
     """
     _hold("no capability is left", process.held_capabilities() == 0)
@@ -209,7 +212,7 @@ def _make_unnamed(path: str, folder: int | None = None) -> None:
 
 
 def _stays_inside(path: str, shared: int) -> bool:
-    """Whether a file made in a view is missing in the folder ``shared``, which refuses files."""
+    """Whether a new file in a view does not appear in the folder ``shared``, which is read-only."""
     name = f".{secrets.token_hex(16)}"
     try:
         with contextlib.suppress(OSError):  # where a runner before filled the scratch, for example

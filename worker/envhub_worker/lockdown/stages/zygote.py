@@ -1,9 +1,9 @@
-"""The zygote's own confinement, once: what all its jails have in common.
+"""The zygote's stage of lockdown: applies once the confinement that all its jails share.
 
-Under ``strict`` the zygote becomes the first process of its own namespaces with a private root,
-so that a jail is a matter of a few cheap mounts, and the zygote's death is every jail's death.
-As root it first becomes a user that owns nothing; the root is built before, while folders like
-/root can still be crossed.
+Under ``strict`` the zygote becomes the first process of its own namespaces with a private root. A
+jail then takes only a few cheap mounts, and every jail ends with its zygote. A root zygote first
+becomes a user that owns nothing; it builds the private root before, while it can still cross
+folders like /root.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from envhub_worker.protocol.runtime import mapped_modules
 
 
 def enter(config: ZygoteConfig) -> Common:
-    """Confine this process as far as its jails have it in common.
+    """Apply to this process the confinement that its jails share.
 
-    Under ``strict`` it returns in a child of the process that called: that one only waits.
+    Under ``strict`` it returns in a child of the calling process, which only waits for the child.
     Raises ``LayerUnavailableError``: the host lacks a layer that the profile names.
     """
     # In this order: the root is planned while the host's files are still in sight. Under ``strict``
@@ -59,7 +59,7 @@ def enter(config: ZygoteConfig) -> Common:
             mounts.mount_skeleton(config.packages)
     abi = landlock.version()
     brokered = needs_broker(namespaced=namespaced, landlock_abi=abi)
-    # A driver keeps more out of sight than a filter could deny.
+    # A driver can allocate memory that neither init sees nor a filter denies.
     programs = tuple(
         compile_filter(
             namespaced=namespaced,
@@ -107,7 +107,7 @@ def _plan_root(config: ZygoteConfig) -> root_plan.RootPlan:
 
 
 def interpreter_paths() -> list[str]:
-    """Everything that this interpreter and this package are loaded from."""
+    """Returns the paths that this interpreter and this package are loaded from."""
     package = os.path.dirname(os.path.abspath(envhub_worker.__file__))
     prefixes = [sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix]
     binaries = [os.path.dirname(sys.executable), os.path.dirname(os.path.realpath(sys.executable))]
@@ -116,7 +116,7 @@ def interpreter_paths() -> list[str]:
 
 
 def _editable_paths() -> Iterator[str]:
-    """Modules elsewhere that finders and links lead to, as after ``pip install -e``."""
+    """Returns paths of modules that finders and links point to, as after ``pip install -e``."""
     suffixes = tuple(importlib.machinery.all_suffixes())
     for path in itertools.chain(*mapped_modules(sys.meta_path).values()):
         folder, name = os.path.split(path)
@@ -130,7 +130,7 @@ def _editable_paths() -> Iterator[str]:
 
 
 def _mapped_folders() -> Iterable[str]:
-    """Folders of the shared libraries in use (an interpreter of nix or conda has its own)."""
+    """Returns the folders of loaded shared libraries (nix and conda interpreters bring theirs)."""
     with open("/proc/self/maps") as maps:
         paths = {line.split(maxsplit=5)[5].rstrip("\n") for line in maps if "/" in line}
     return {os.path.dirname(path) for path in paths if path.startswith("/") and ".so" in path}
@@ -169,7 +169,7 @@ def _become(config: ZygoteConfig, at_parents_death: int) -> None:
 
 
 def _check_interpreter() -> None:
-    """Without a private root, the new user needs the host's permission to read its Python."""
+    """Check that the new user may read the interpreter, which no private root shows it."""
     for path in (os.__file__, sys.prefix, __file__):
         if not os.access(path, os.R_OK):
             raise LayerUnavailableError(
@@ -200,12 +200,12 @@ def _check_packages(folder: str) -> None:
 
 
 def _be_the_first_process() -> None:
-    """Fork: the child goes on as pid 1 of the new pid namespace, and we wait for its end."""
+    """Fork: the child continues as pid 1 of the new pid namespace; the parent waits for its end."""
     child = os.fork()
     if child:
         process.close_all_but({2})
         _, status = os.waitpid(child, 0)
         code = os.waitstatus_to_exitcode(status)
         os._exit(code if code >= 0 else 128 - code)
-    # The parent lives outside, where its pid means nothing to us: 0 stands for it.
+    # The parent lives outside the pid namespace, where we see it as pid 0.
     process.die_with_parent(0, signal.SIGKILL)
