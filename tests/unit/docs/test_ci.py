@@ -26,7 +26,6 @@ esac
 for one in "$@"; do echo "<$one>"; done
 exit ${ENVHUB_CODE:-0}
 """
-
 _INSTALLERS = ("venv", "pip")
 
 

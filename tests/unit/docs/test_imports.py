@@ -38,7 +38,6 @@ OPTIONAL = {
     "envhub_sandbox.integrations.pytest_plugin": {"pytest"},
 }
 DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "shelve"}
-
 # Which package may import which; a package is a folder or a module right below one of the two, or
 # an extra. What an extra imports of others is little: the two tests of the table see to that.
 # Every package may import the lowest ones, LOWEST, as far as these stand below it.

@@ -54,12 +54,7 @@ CALLS: list[tuple[tuple[Any, ...], dict[str, Any]]] = [
     ((), {"first": 1, "third": [3]}),
     ((1, "x", [2], None), {}),
 ]
-WRONG: list[tuple[tuple[Any, ...], dict[str, Any]]] = [
-    ((), {}),
-    ((1, "x", [2], None, 5), {}),
-    ((1,), {"first": 2}),
-    ((1,), {"other": 2}),
-]
+WRONG = [((), {}), ((1, "x", [2], None, 5), {}), ((1,), {"first": 2}), ((1,), {"other": 2})]
 
 
 @pytest.mark.parametrize(("values", "named"), CALLS)

@@ -15,7 +15,6 @@ from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
 
 Plain = tuple[int, list[bytes]]
 LIMITS = WireLimits(header_bytes=1000, frame_bytes=10_000, message_bytes=12_000, frames=4)
-
 frames = st.lists(st.binary(max_size=200), min_size=1, max_size=4)
 packets = st.lists(st.tuples(st.integers(0, 2**63 - 1), frames), max_size=5)
 

@@ -1,6 +1,5 @@
 """Whatever a stranger says is text on a page, and the page's policy forbids all else."""
 
-from collections.abc import Callable, Sequence
 from xml.etree import ElementTree
 
 import pytest
@@ -49,7 +48,7 @@ _NUMBERS: dict[str, list[float]] = {
     "not all": [1.0, float("nan"), float("inf"), -float("inf"), 2.0],
     "many": [float(value % 17) for value in range(10_000)],
 }
-_DRAWN: dict[str, Callable[[Sequence[float]], str]] = {
+_DRAWN = {
     "bars": lambda values: bar_plot("x", values),
     "histogram": lambda values: histogram_plot("x", values),
     "course": lambda values: line_plot("x", values, [(len(values) - 1, "a"), (1, "b")]),

@@ -32,7 +32,6 @@ from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 
 pytestmark = pytest.mark.usefixtures("snapshot_store")
-
 MAKE = "\ndef make_env(n_envs=1, use_async_envs=False): ..."
 
 

@@ -29,7 +29,6 @@ from tests.support.packages.wheels import WORKERS, Index, make_wheel
 from tests.unit.docs.test_distributions import project
 
 __all__ = ["project"]
-
 HERE = Target(python=os.path.realpath(sys.executable))
 
 

@@ -17,7 +17,6 @@ from envhub_sandbox.hub.reference import HubRef, is_local, pinned
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 SITE = "https://huggingface.co"
 GITHUB = "https://github.com/org/repo"
-
 WORKING = {
     # LeRobot's four forms.
     "org/repo": HubRef("org/repo"),
@@ -78,7 +77,6 @@ WORKING = {
     ),
     "pypi:x#y.z:Id-v0": HubRef("x#y.z:Id-v0", repo_type="pypi"),
 }
-
 # The text, what the error says is wrong, and what it says to write.
 REFUSED = [
     ("", "empty", "owner/name"),

@@ -4,7 +4,6 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -181,7 +180,7 @@ def test_with_other_hashes_everything_counts(tmp_path: Path, snapshot_store: Pat
     assert set(files(folder)) == {".gitignore", "env.py", "forced.pyc", "other.pyc"}
 
 
-SPOIL: dict[str, Callable[[Path], object]] = {
+SPOIL = {
     "no index": lambda git: (git / "index").write_bytes(
         b"DIRC\0\0\0\x02" + b"\xff" * 4 + b"x" * 64
     ),

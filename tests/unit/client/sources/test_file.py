@@ -1,7 +1,6 @@
 """A file that is named alone gives its code nothing of its folder that is not its own."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -193,7 +192,7 @@ def test_one_line_says_what_the_code_sees(folder: Path, caplog: pytest.LogCaptur
     ]
 
 
-MISTYPED: dict[str, Callable[[Path], str]] = {
+MISTYPED = {
     r"no such folder or file here.*Did you mean '.*/env\.py'": lambda folder: f"{folder}/evn.py",
     r"Name the entry file after a colon, as in ':env\.py'": lambda folder: f"{folder}:evn.py",
     r"has no file 'env\.py'.*as in ':gym_env\.py'": lambda folder: (

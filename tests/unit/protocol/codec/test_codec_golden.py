@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +14,7 @@ from tests.support.compare import assert_same
 from tests.support.decode import decode
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "values.json"
-
-GOLDEN_VALUES: dict[str, Any] = {
+GOLDEN_VALUES = {
     "none": None,
     "bool": [True, False],
     "int": [0, -1, 127, 2**32, -(2**63), 2**64 - 1],

@@ -22,7 +22,6 @@ from tests.support.compare import assert_same
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "messages"
 REQUEST_ID = 7
-
 # One message of each class, with every kind of content that its fields may have.
 SAMPLES: list[m.Message] = [
     m.Hello(m.VERSION, bytes(range(16))),

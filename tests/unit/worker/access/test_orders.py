@@ -57,9 +57,7 @@ def test_a_snapshot_has_the_name_of_its_sorted_listing() -> None:
 
 
 def order(**fields: Any) -> m.NeedPackages:
-    nothing: dict[str, Any] = dict.fromkeys(
-        ("requirements", "guesses", "constraints", "override", "without"), ()
-    )
+    nothing = dict.fromkeys(("requirements", "guesses", "constraints", "override", "without"), ())
     texts = dict.fromkeys(("supports", "python", "exclude_newer"), "")
     return m.NeedPackages(**{**nothing, **texts, "always": False, "gpu": False, **fields})
 

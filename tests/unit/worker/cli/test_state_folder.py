@@ -13,7 +13,6 @@ from envhub_worker.extras.access.commands.state_folder import Note, ServerNote
 
 A = ServerNote("tcp://127.0.0.1:1", "insecure", "/a key")
 B = ServerNote("tcp://127.0.0.1:2", "insecure", "/b")
-
 _WRITER = """
 import os, signal, sys
 from pathlib import Path

@@ -27,8 +27,6 @@ import subprocess, sys
 code = "import mine, sys; print(mine.mine, sys.prefix)"
 result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout
 """
-
-
 STRICT = Confinement(profile="strict")
 
 

@@ -17,7 +17,6 @@ from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import make_wheel
 
 pytestmark = pytest.mark.usefixtures("snapshot_store")
-
 OWN = interpreters.own()
 
 

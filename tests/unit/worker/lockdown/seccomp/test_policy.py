@@ -37,7 +37,6 @@ NO_ATTRIBUTES = 0x00050000 | errno.ENOTSUP
 NO_MEMORY = 0x00050000 | errno.ENOMEM
 NOT_A_TTY = 0x00050000 | errno.ENOTTY
 VARIANTS = [(True, "none"), (True, "loopback"), (True, "host"), (False, "none"), (False, "host")]
-
 machines = pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
 
 
