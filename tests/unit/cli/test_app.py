@@ -70,7 +70,6 @@ _HEAVY = {"numpy", "gymnasium", "zmq", "huggingface_hub", "msgpack", "imageio_ff
     ],
 )
 def test_a_help_loads_nothing_heavy(words: list[str], shown: str, unwanted: set[str]) -> None:
-    """In a fresh interpreter; the list of commands imports none of them."""
     code = (
         f"import sys\nfrom envhub_sandbox.cli.app import app\napp({words}, standalone_mode=False)\n"
         f"sys.exit(' '.join({_HEAVY | unwanted} & set(sys.modules)) or 0)"
@@ -268,7 +267,6 @@ def test_a_wrapped_line_begins_no_command(
 
 
 def test_what_takes_long_has_lines_in_a_log(capfd: pytest.CaptureFixture[str]) -> None:
-    """It says what and for how long, and again; nothing of what was over before."""
     written: list[str] = []
 
     def lines() -> list[str]:

@@ -98,7 +98,6 @@ def test_a_snapshot_is_called_by_repository_or_commit() -> None:
 
 @pytest.mark.parametrize("name", ["my-env", "a", "A.b_c", "x" * 96])
 def test_a_repository_has_the_name_of_its_folder(name: str) -> None:
-    """Where the Hub takes it; its files are Python that can be read, and name it."""
     assert init.repository_name(Path(name)) == name
     files = init.starter(name, 2026)
     assert {"env.py", "README.md", "LICENSE"} <= set(files)
@@ -283,7 +282,6 @@ def test_the_code_is_the_verdict(
 
 
 def test_a_silent_server_is_older(looks: Examine, capsys: pytest.CaptureFixture[str]) -> None:
-    """That is no reason to refuse it; and a hostile name is one line of text."""
     assert looks({}) is Exit.OK
     assert "older than this client" in capsys.readouterr().out
     looks(SAID | {"quotas": {"a\n\x1b[2J[red]b_bytes": 1}})

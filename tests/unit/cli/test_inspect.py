@@ -32,7 +32,6 @@ def envhub(*arguments: str | Path) -> Result:
 
 
 def document(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
-    """What a command prints with ``--json``."""
     done = envhub(*arguments, "--json")
     assert done.exit_code == code, done.output
     read: dict[str, Any] = json.loads(done.stdout)
@@ -122,7 +121,6 @@ def differing(tmp_path: Path, entry: str = _ENTRY, **files: str) -> list[tuple[s
 
 
 def test_what_is_the_same_differs_in_nothing(tmp_path: Path) -> None:
-    """Wherever it lies; lines that move are a changed file and no new findings."""
     assert differing(tmp_path / "a") == []
     moved = differing(tmp_path / "b", f"# a comment\n{_ENTRY}")
     assert [row[:2] for row in moved] == [("file", "changed")]
@@ -135,7 +133,6 @@ def test_what_is_the_same_differs_in_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("blank", ["\f", "\x1c", "\x85", "\u2028"])
 def test_no_change_hides_behind_another(blank: str, tmp_path: Path) -> None:
-    """What ends no line for Python ends none here, and what is not read is not called equal."""
     comment, code = (f"x = {x}\n#{end}import os\n" for x, end in ((1, blank), (2, "\n")))
     assert "os" not in compile(comment, "", "exec").co_names, "the control: it is a comment"
     assert "os" in compile(code, "", "exec").co_names
@@ -210,7 +207,6 @@ def test_a_folder_is_held_against_what_the_hub_has(tmp_path: Path) -> None:
     ("options", "code"), [([], 7), (["--fail-on", "note"], 1), (["--fail-on", "warning"], 0)]
 )
 def test_the_exit_code_says_if_pins_may_move(options: list[str], code: int, tmp_path: Path) -> None:
-    """7 if anything differs; 1 only for a new finding, where that is asked for."""
     old, new = repository(tmp_path / "old"), repository(tmp_path / "new", "import pty\n" + _ENTRY)
     assert envhub("diff", old, new, *options).exit_code == code
     assert envhub("diff", old, old, *options).exit_code == 0

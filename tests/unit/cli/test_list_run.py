@@ -56,7 +56,6 @@ def called(*arguments: str) -> Result:
 
 
 def test_each_is_judged_by_what_holds_here(judged: Judged) -> None:
-    """From the command line, or a file; where one cannot be judged the others are."""
     Path("settings.toml").write_text("[check]\nsteps = 7\n")
     done = called("--all", "list", "--settings", "settings.toml", "--resets", "0", "--json")
     assert done.exit_code == Exit.UNJUDGED, done.output

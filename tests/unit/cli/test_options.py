@@ -48,7 +48,6 @@ def test_every_option_of_a_command_reaches_make_env() -> None:
 
 
 def test_env_kwargs_take_json_and_pairs() -> None:
-    """Values are JSON where they can be; later ones win. What is neither is refused."""
     pairs = ("size=9", "mode=rgb_array", "on=true", "path=a=b", "empty=")
     merged = {"size": 9, "name": "a", "mode": "rgb_array", "on": True, "path": "a=b", "empty": ""}
     assert read_env_kwargs(['{"size": 8, "name": "a"}', *pairs]) == merged
@@ -83,7 +82,6 @@ def test_a_timeout_is_for_every_operation_but_close() -> None:
 
 
 def test_running_unprotected_needs_the_word() -> None:
-    """Before anything is fetched, and in the words of the command line."""
     with pytest.raises(UsageError, match="--trust-remote-code"):
         options(sandbox="none").arguments()
     assert options(sandbox="none", trust_remote_code=True).arguments()["sandbox"] is None
@@ -113,7 +111,6 @@ SUITES: dict[str, dict[Any, Any]] = {"a": {0: "a0", 1: "a1"}, "b": {"x": "bx", 0
     ],
 )
 def test_selection_keeps_the_order(suites: Any, tasks: Any, expected: list[str]) -> None:
-    """Task ids may be numbers or text; on the command line both are text."""
     assert [env for _, _, env in select_envs(SUITES, suites, tasks)] == expected
     with pytest.raises(UsageError, match=r"a/0, .*evil\\x1b/0"):  # with what there is, escaped
         select_envs({**SUITES, "evil\x1b": {0: 1}}, ["c"], None)

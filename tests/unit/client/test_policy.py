@@ -16,7 +16,6 @@ from envhub_sandbox.settings.policy import limits_from, policy_from, timeouts_fr
 
 @pytest.mark.parametrize("cls", [Policy, Limits, Timeouts])
 def test_values_are_frozen_and_by_name_only(cls: type) -> None:
-    """Nobody can change a policy that is in force, or mistake one field for another."""
     made = cls()
     name = dataclasses.fields(cls)[0].name
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -126,7 +125,6 @@ def test_what_is_given_means(made: object, meant: object) -> None:
 
 
 def test_limits_argument_changes_what_it_names() -> None:
-    """``make_env(limits=...)`` is the last word on these, and leaves the others alone."""
     given = {"network": "host", "limits": {"processes": 5, "output_bytes": 9}}
     policy = policy_from(given, {"processes": 7})
     assert policy == Policy(network="host", limits=Limits(processes=7, output_bytes=9))
@@ -134,7 +132,6 @@ def test_limits_argument_changes_what_it_names() -> None:
 
 
 def test_only_named_variables_get_a_value(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Variables are granted by name; what is not set is not granted."""
     monkeypatch.setenv("GRANTED", "yes")
     monkeypatch.setenv("SECRET", "no")
     monkeypatch.delenv("UNSET", raising=False)

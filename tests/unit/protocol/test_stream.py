@@ -43,7 +43,6 @@ def cut(data: bytes, cuts: list[int]) -> list[bytes]:
 
 @given(packets, st.lists(st.integers(0, 2000), max_size=20) | st.just(list(range(5000))))
 def test_packets_arrive_whole_however_the_stream_is_cut(sent: list[Plain], cuts: list[int]) -> None:
-    """What was packed comes out, in order, also byte by byte, and nothing before it is whole."""
     assert read(cut(on_the_wire(sent), cuts)) == sent
 
 

@@ -13,7 +13,6 @@ _HOSTILE = "<script>alert(1)</script>\"'&\x1b[2J\u202e"
 
 @pytest.mark.parametrize("limit", [10, 1_000])
 def test_text_has_no_meaning_for_html(limit: int) -> None:
-    """Between tags and in an attribute; and no terminal obeys it."""
     made = markup.text(_HOSTILE, limit)
     [(tag, attributes)] = Page(f'<p title="{made}">{made}</p>').tags
     assert (tag, [name for name, _ in attributes]) == ("p", ["title"])
@@ -101,7 +100,6 @@ def test_nothing_is_drawn_of_nothing(kind: str) -> None:
 
 @pytest.mark.parametrize("count", [2, 3, 7])
 def test_few_values_have_wide_bars_with_their_labels_below(count: int) -> None:
-    """Of bars at the left no label stands at the right; a share of two values is no thin line."""
     drawn = ElementTree.fromstring(bar_plot("x", [1.0] * count))
     bars = [one for one in drawn if one.tag == "rect"]
     feet = {one.text: float(one.attrib["x"]) for one in drawn if one.attrib.get("y") == "146.0"}

@@ -36,7 +36,6 @@ def test_a_page_has_the_tags_of_ours_alone(text: str) -> None:
 
 
 def test_a_page_needs_and_runs_nothing() -> None:
-    """No script, no link, no picture from elsewhere; and a browser is told so."""
     made = report_of("http://example.com/x.js")
     found = Page(page(made, []))
     attributes = {name for tag, attrs in found.tags for name, _ in attrs if tag not in _DRAWN}

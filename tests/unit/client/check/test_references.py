@@ -16,7 +16,6 @@ def read(text: str) -> list[ListEntry]:
 
 
 def test_one_reference_a_line(tmp_path: Path) -> None:
-    """Comments, empty lines, Windows' ends of lines and a byte order mark are none."""
     (tmp_path / "my env").mkdir()
     text = f"\ufeff# ours\r\n\r\norg/repo@{_COMMIT}\r\n  spaces/a/b:x.py  \n{tmp_path}/my env\n"
     found = read(text)

@@ -120,7 +120,6 @@ def test_findings_are_bounded() -> None:
 
 
 def test_a_flood_of_notes_hides_no_error() -> None:
-    """What fails a repository is kept, however much was found in its source before."""
     made = Report("./walk:env.py")
     for number in range(10_000):
         made.add(Finding("source-dynamic", "calls eval", file="env.py", line=number))
@@ -130,7 +129,6 @@ def test_a_flood_of_notes_hides_no_error() -> None:
 
 
 def mixed() -> Report:
-    """What was found in the order in which it is found: notes first, an error last."""
     made = Report("./walk:env.py")
     for check in ("card", "slow-steps", "licence", "denied-files", "runs", "seeding"):
         made.judged(check, [f"about {check}"], "a / 0")
@@ -169,7 +167,6 @@ def test_the_most_severe_stands_first_in_every_form() -> None:
     ],
 )
 def test_a_verdict_is_a_sentence(found: list[str], allowed: list[str], says: str) -> None:
-    """The same for people on a terminal, on a page and in GitHub's summary."""
     made = Report("./walk:env.py")
     for check in ("loads", "imports"):
         made.judged(check, [])

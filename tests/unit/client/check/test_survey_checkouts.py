@@ -207,7 +207,6 @@ def commit(folder: Path, files: dict[str, tuple[str, bytes]]) -> None:
 
 
 def one_kind(files: dict[str, tuple[str, bytes]]) -> dict[str, tuple[str, bytes]]:
-    """Without files that lie below others."""
     links = [f"{path}/" for path in files]
     return {path: one for path, one in files.items() if not path.startswith(tuple(links))}
 

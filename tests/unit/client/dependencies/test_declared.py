@@ -37,7 +37,6 @@ def test_plain_requirements_get_through(tmp_path: Path) -> None:
 
 
 def test_hashes_stand_on_the_line_or_on_the_next(tmp_path: Path) -> None:
-    """As pip and uv write them; the line that is named is the first."""
     text = f"numpy==2.0 --hash={HASH}\nfoo==1 \\\n    --hash={HASH} \\\n    --hash={HASH}\nbar\n"
     found = repository(tmp_path, requirements__txt=text)
     assert [(len(one.hashes), one.where) for one in found.wanted] == [
@@ -66,7 +65,6 @@ def test_hashes_stand_on_the_line_or_on_the_next(tmp_path: Path) -> None:
     ],
 )
 def test_whatever_could_run_code_does_not(tmp_path: Path, line: str) -> None:
-    """The line is named; an option does not hide behind the end of a line either."""
     with refused_dependency("requirement", match=r"line 2 of requirements\.txt"):
         repository(tmp_path, requirements__txt=f"numpy\n{line}\n")
 
@@ -108,7 +106,6 @@ def test_what_windows_writes_is_read(tmp_path: Path, encoding: str) -> None:
 
 
 def test_further_files_of_the_repository_are_read(tmp_path: Path) -> None:
-    """Relative to the file that names them, each once; what a constraint file leads to is one."""
     (tmp_path / "more").mkdir()
     (tmp_path / "more/base.txt").write_text("numpy\n-r ../requirements.txt\n-c=held.txt\n")
     (tmp_path / "more/held.txt").write_text("foo<2\n-r deeper.txt\n")
@@ -215,7 +212,6 @@ def test_what_declares_nothing(tmp_path: Path, name: str, text: str) -> None:
     ],
 )
 def test_a_spoiled_project_is_refused(tmp_path: Path, text: str, said: str) -> None:
-    """With what is wrong and what to do; deep or dotted TOML costs no time."""
     with refused_dependency("requirement", match=re.escape(said)) as caught:
         repository(tmp_path, pyproject__toml=text)
     assert "pyproject.toml" in str(caught.value)

@@ -181,7 +181,6 @@ made(Path(sys.argv[1]))
 
 @pytest.mark.parametrize("step", ["install", "publish"])
 def test_killed_makers_leave_nothing_that_is_used(index: Index, tmp_path: Path, step: str) -> None:
-    """At each step: the next one takes away what is half-made, and makes it anew."""
     make_wheel(index.folder, "wanted")
     folder, reached = repository(tmp_path / "repo", "wanted"), tmp_path / "reached"
     words = [sys.executable, "-c", KILLED, str(folder), step, str(reached)]
@@ -263,7 +262,6 @@ def test_what_fails_after_choosing_leaves_nothing(index: Index, tmp_path: Path) 
 
 
 def test_a_full_disk_is_said(index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With what frees some; nothing half stays, and what was there stays whole."""
     kept = made(repository(tmp_path / "other"))
     make_wheel(index.folder, "wanted")
 

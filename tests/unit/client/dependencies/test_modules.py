@@ -94,7 +94,6 @@ def test_a_commit_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_it_is_installed_and_told(index: Index, tmp_path: Path) -> None:
-    """With what is declared; once it is known it is not told again."""
     for name in ("declared", "chess"):
         make_wheel(index.folder, name)
     found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="declared\n")
@@ -280,7 +279,6 @@ def request(name: str, **fields: Any) -> PackageRequest:
 
 
 def test_a_release_is_tried_and_kept(tried: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """The newest first, after our own; the next time it is known which."""
     stamps = {"/opt/3.98.0": [1, 1]}
     monkeypatch.setattr(*inside.TELLING_RELEASES_APART, lambda one: stamps.get(one.path, [0, 0]))
     found = resolutions.resolution_for(request("a"))

@@ -188,7 +188,6 @@ def test_an_index_that_has_both(cuda: Path) -> None:
 
 
 def test_an_index_without_stays_as_it_is(cuda: Path, index: Index) -> None:
-    """The size of what comes is told before, and once."""
     make_wheel(cuda, "torch", "2.4+cpu")
     index.uploaded["torch-2.5-py3-none-any.whl"] = "2026-01-01"
     assert names(TORCH) == {"torch==2.5", "torchvision==0.20", "nvidia-cublas==1.0"}
@@ -201,7 +200,6 @@ def test_an_index_without_stays_as_it_is(cuda: Path, index: Index) -> None:
 
 @pytest.mark.parametrize("gpu", [True, False])
 def test_who_has_a_gpu_gets_cuda(gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a second look at the index; likewise who has told uv which build he wants."""
     lock = CUDA
     if not gpu:
         monkeypatch.setenv("UV_TORCH_BACKEND", "cu128")

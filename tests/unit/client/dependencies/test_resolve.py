@@ -147,7 +147,6 @@ def test_the_advice_is_one_with_which_there_are_versions(
 
 
 def test_requirements_are_left_out_replaced_and_constrained(index: Index) -> None:
-    """Whoever needs them; a constraint holds only for what is needed, and is named in an error."""
     make_wheel(index.folder, "one", requires=["shared", "unwanted"])
     make_wheel(index.folder, "shared", "1.0")
     make_wheel(index.folder, "shared", "2.0")
@@ -175,7 +174,6 @@ def test_another_python_is_told_from_another_fault(index: Index) -> None:
 
 
 def test_a_hash_of_the_repositorys_is_kept(index: Index) -> None:
-    """Of several files of a version only the named one; a wrong one is no file at all."""
     wheels = [make_wheel(index.folder, "wanted", tag=f"{py}-none-any") for py in ("py3", "py31")]
     hashes = [hashlib.sha256(wheel.read_bytes()).hexdigest() for wheel in wheels]
     assert all(known in resolve("wanted").text for known in hashes)
@@ -280,7 +278,6 @@ def another_uv(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str
 def test_who_holds_the_stderr_of_a_uv_that_has_ended_is_not_waited_for(
     another_uv: Callable[[str], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What uv itself has written is heard to its last line."""
     monkeypatch.setattr(uv, "LISTEN_S", 3.0)
     told = list[str]()
     another_uv(

@@ -56,14 +56,12 @@ def test_limit_stops_reading_the_listing() -> None:
     ],
 )
 def test_hostile_name_is_refused(path: str) -> None:
-    """A name that could climb, hide, or break a file system names itself in the error."""
     with pytest.raises(SnapshotError, match="refused"):
         listing.check_listing_names([record("env.py"), record(path)], "t")
 
 
 @pytest.mark.parametrize("paths", [["a", "a"], ["a", "a/b"], ["a/b/c", "a/b"]])
 def test_names_that_clash_are_refused(paths: list[str]) -> None:
-    """Two files of one name, or a file that is also a folder, cannot both be laid out."""
     with pytest.raises(SnapshotError, match=r"listed twice|both a file and a folder"):
         listing.check_listing_names(map(record, paths), "t")
 

@@ -45,7 +45,6 @@ def test_folder_becomes_a_read_only_copy(folder: Path) -> None:
 
 
 def test_unchanged_content_is_the_same_snapshot(folder: Path) -> None:
-    """The commit is the content's: equal for a copy elsewhere or a link, other after an edit."""
     first = local(folder)
     os.utime(folder / "env.py", (0, 0))
     assert local(folder) == first
@@ -189,7 +188,6 @@ def test_what_cannot_be_read_is_left_out_and_said(open_ground: Path) -> None:
 
 
 def test_link_inside_becomes_a_real_file(folder: Path) -> None:
-    """Links that stay inside arrive as what they point to, so that the tree needs no links."""
     (folder / "link.py").symlink_to("sub/other.py")
     (folder / "linked").symlink_to("sub")
     snapshot = local(folder)
@@ -259,7 +257,6 @@ def test_large_folder_is_refused(folder: Path, name: str, monkeypatch: pytest.Mo
 
 
 def test_edited_copy_is_refused_and_half_of_one_made_again(folder: Path) -> None:
-    """The copy in the store is verified at every use; its source is at hand."""
     snapshot = local(folder)
     entry = snapshot.root / "env.py"
     snapshot.root.chmod(0o755)

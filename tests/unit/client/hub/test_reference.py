@@ -156,7 +156,6 @@ REFUSED = [
 
 @pytest.mark.parametrize("text", WORKING)
 def test_form_is_read(text: str) -> None:
-    """Each is read into the reference that it can only mean; so is what that one prints."""
     ref = HubRef.parse(text)
     assert ref == WORKING[text] == HubRef.parse(str(ref))
     assert HubRef.parse(ref.meaning).meaning == ref.meaning
@@ -193,7 +192,6 @@ def test_token_in_a_url_is_not_repeated(text: str) -> None:
 
 
 def test_something_else_than_text_is_refused() -> None:
-    """A path object or None gets the grammar, not an AttributeError; LeRobot's is a ValueError."""
     with pytest.raises(HubReferenceError, match="owner/name@revision"):
         HubRef.parse(None)
     assert issubclass(HubReferenceError, ValueError)
@@ -220,7 +218,6 @@ def test_reference_that_no_hub_has_cannot_be_built(fields: dict[str, str]) -> No
 
 
 def test_local_folders_are_told_from_references() -> None:
-    """Paths that start like paths are local; everything else is the Hub's."""
     assert all(map(is_local, [".", "..", "~", "./env", "../env", "/env", "~/env", "examples:env"]))
     assert not any(map(is_local, ["env", "org/repo", ".hidden/name"]))
 

@@ -198,7 +198,6 @@ def test_equal_file_is_hashed_once(published: store.Slot, monkeypatch: pytest.Mo
 def test_copied_store_is_verified_by_content(
     published: store.Slot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A store that moved to another disk has other inodes: it is hashed, and then works."""
     source = tmp_path / "envhub-cache"
     subprocess.run(["cp", "-r", str(source), str(tmp_path / "moved")], check=True)
     folder = tmp_path / "moved" / published.folder.relative_to(source)
@@ -207,8 +206,6 @@ def test_copied_store_is_verified_by_content(
 
 
 def test_failing_copy_leaves_nothing(slot: store.Slot) -> None:
-    """A snapshot that could not be finished is not there, nor is any part of it."""
-
     def fail(record: FileRecord, target: Path) -> None:
         write(record, target)
         if record.path == "env.py":
@@ -259,7 +256,6 @@ def test_a_failing_store_says_where(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_store_is_in_the_users_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """$ENVHUB_CACHE moves the store; without it the platform's cache folder is used."""
     monkeypatch.setenv("ENVHUB_CACHE", "~/x")
     monkeypatch.setenv("HOME", str(tmp_path))
     assert cache_root() == tmp_path / "x"
@@ -292,7 +288,6 @@ def test_endpoints_types_and_names_have_places_of_their_own(snapshot_store: Path
 
 
 def test_unused_snapshots_are_removed(published: store.Slot) -> None:
-    """What nobody asked for in that time goes; what was used stays."""
     other = store.Slot(published.folder, "d" * 40, "x")
     store.publish(other, records(), write, {})
     for slot in (published, other):
@@ -323,7 +318,6 @@ def test_a_tree_of_any_depth_is_walked_and_removed(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["git-sha1", "sha256"])
 def test_copy_is_what_the_record_says_or_an_error(tmp_path: Path, kind: str) -> None:
-    """It is hashed on its way: equal bytes pass; others, more, fewer, and a pipe do not."""
     source = tmp_path / "source"
     data = os.urandom(2_500_000)
     source.write_bytes(data)

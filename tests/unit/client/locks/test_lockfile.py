@@ -46,7 +46,6 @@ def changed(**fields: Any) -> LockFile:
 
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
-    """Every field, with quotes in names; under the mode of any other new file."""
     path = tmp_path / "pylock.repo.toml"
     lockfile.write(LOCK, path)
     assert lockfile.read(path) == LOCK
@@ -121,7 +120,6 @@ def test_hashes_of_the_repository_hold_in_its_lock(index: Index, tmp_path: Path)
 
 
 def test_upgrading_shows_what_differs(index: Index, tmp_path: Path) -> None:
-    """Versions stay as they were chosen until somebody asks for others."""
     make_wheel(index.folder, "wanted", "1.0")
     before = made(tmp_path / "repo", "wanted")
     make_wheel(index.folder, "wanted", "2.0", requires=["its-own"])
@@ -177,7 +175,6 @@ OTHER_TASK = fingerprint_of_task("suite", 0, "NextStep", OTHER_BOX, gym.spaces.D
     ],
 )
 def test_what_differs_is_said(now: LockFile, said: str) -> None:
-    """Commit, file, package, Python, spaces; a line each, fit for a terminal."""
     assert making.differences(LOCK, LOCK) == []
     of_other_arguments = Spaces("{}", (dataclasses.replace(TASK, mode="SameStep"),))
     assert making.differences(LOCK, changed(spaces=of_other_arguments)) == []

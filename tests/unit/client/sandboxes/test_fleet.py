@@ -53,7 +53,6 @@ def test_a_secret_key_is_in_copies_and_in_no_pickle() -> None:
 
 
 def test_places_stand_in_a_list_or_a_text() -> None:
-    """In their order, also twice; behind an address its key."""
     given = ["tcp://a:1", PROCESS, "tcp://a:1"]
     assert places_of(given) == given
     assert places_of("tcp://a:1 KEY, process,") == ["tcp://a:1 KEY", "process"]

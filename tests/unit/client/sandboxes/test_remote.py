@@ -129,7 +129,6 @@ def test_a_servers_key_is_given_or_known(config: Path, monkeypatch: pytest.Monke
 
 
 def test_our_key_is_a_text_or_a_file(config: Path) -> None:
-    """By default the one that lies where ``keygen`` is advised to write it."""
     with pytest.raises(errors.SandboxUnavailableError, match="keygen"):
         remote_keys.client_key(None)
     pair = keys.generate()

@@ -98,7 +98,6 @@ def test_a_bundle_comes_back(tmp_path: Path) -> None:
     ],
 )
 def test_a_broken_index_is_refused(tmp_path: Path, path: tuple[Any, ...], value: Any) -> None:
-    """Types, bounds, names of files: everything is checked before it is used."""
     folder = bundle(tmp_path)
     edit(folder, *path, value=value)
     with pytest.raises(BundleError, match="cannot be read as a crash bundle"):

@@ -67,7 +67,6 @@ def test_what_shards_were_sent_is_kept_as_it_was_asked() -> None:
 
 
 def test_requests_come_back_in_order() -> None:
-    """Every step keeps its dtype; what only pickle can carry is described."""
     kept = History(100)
     reset(kept, [1, 2])
     kept.step(np.array([0, 1]))
@@ -111,7 +110,6 @@ def test_a_reset_that_seeds_all_begins_anew() -> None:
 
 
 def test_attributes_and_calls_outlast_a_reset() -> None:
-    """In order, before everything else; equal ones once, where the last of them was."""
     kept = History(100)
     ask(kept, m.SetAttr(0, "a", (1, 1)))
     for argument in (1, 2, 1):

@@ -96,7 +96,6 @@ def test_false_deaths_are_refused(reply: m.RelayDonePartly, parts: tuple[m.Messa
 
 
 def test_derived_seeds_are_documented_and_all_different() -> None:
-    """As ``docs/faults.md`` says; neither siblings nor restarts share one."""
     assert derived_seed(5, 1) == int(np.random.SeedSequence((5, 1)).generate_state(1)[0])
     assert derived_seed(None, 1) is None
     assert len({derived_seed(seed, n) for seed in range(20) for n in range(20)}) == 400

@@ -85,7 +85,6 @@ def test_a_late_reply_is_refused_until_a_reset(session: EnvSession, lane: FakeLa
 
 
 def test_the_order_is_gymnasiums(session: EnvSession) -> None:
-    """A wait without its request, a request before its wait, and anything after close."""
     requests = session.requests
     with pytest.raises(NoAsyncCallError, match="`step_wait` without any prior"):
         requests.end_wait("step")

@@ -50,7 +50,6 @@ def step(queue: WorkerQueue) -> None:
 
 
 def test_so_many_may_be_owed_and_no_more(queue: WorkerQueue, lane: FakeLane) -> None:
-    """The refusal names the sub-environment, and takes nothing away."""
     assert (queue.rows, queue.count, queue.busy, queue.lane) == ((1, 2), 1, False, None)
     for _ in range(MAX_IN_FLIGHT):
         step(queue)

@@ -36,7 +36,6 @@ def test_most_cards_declare_nothing(tmp_path: Path, text: str) -> None:
 
 
 def test_assets_are_a_list_of_texts(tmp_path: Path) -> None:
-    """In both of YAML's forms, with either end of line; order is kept."""
     rows = f"---\r\nenvhub:\r\n  assets:\r\n  - org/b@{PIN}\r\n  - datasets/org/a@x\r\n---\r\n"
     assert declared(tmp_path, rows) == [f"org/b@{PIN}", "datasets/org/a@x"]
     assert declared(tmp_path, '---\nenvhub: {assets: ["org/b", 5]}\n---\n') == ["org/b", "5"]

@@ -40,7 +40,6 @@ def left_out(folder: Path) -> list[tuple[str, str]]:
 
 
 def test_what_is_committed_counts_wherever_it_lies(repository: GitRepository) -> None:
-    """Folders and files that tools make are in the commit, if somebody commits them."""
     repository.commit(dict.fromkeys(PLACES, "payload"))
     assert files(repository.folder) == {**dict.fromkeys(PLACES, "payload"), "env.py": "1"}
     assert left_out(repository.folder) == []

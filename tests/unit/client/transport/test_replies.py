@@ -107,7 +107,6 @@ def test_a_missing_package_is_an_import_error(reason: str, known: str) -> None:
     ],
 )
 def test_other_names_mean_nothing(changed: dict[str, str]) -> None:
-    """A worker cannot choose what is raised beyond a fixed table."""
     assert type(raised(a_raised(**changed))) is errors.RemoteEnvError
 
 
@@ -232,7 +231,6 @@ def test_deaths_say_how(reply: m.Death, text: str) -> None:
     ],
 )
 def test_refusals_come_from_a_table(name: str, expected: type[Exception]) -> None:
-    """What the client does not know is a WorkerError; a missing layer comes with its fix."""
     assert type(refusal(m.Refusal(name, "text", "", ""))) is expected
     error = refusal(m.Refusal("SandboxUnavailableError", "it is off", "landlock", "turn it on"))
     assert str(error) == "this host cannot enforce landlock: it is off\nturn it on"

@@ -104,7 +104,6 @@ def test_what_may_share_state_stays_together(path: Path) -> None:
 
 @given(count=st.integers(1, 200), cpus=st.integers(1, 70))
 def test_every_sub_environment_has_one_shard(count: int, cpus: int) -> None:
-    """Slices are adjacent, none is empty, together they are all; one shard is the last resort."""
     ways = ways_to_cut(count, cpus)
     for bounds in ways:
         assert [start for start, _ in bounds] == [0, *(stop for _, stop in bounds[:-1])]

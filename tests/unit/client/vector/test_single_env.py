@@ -104,7 +104,6 @@ class _Numbered(_Story):
 
 
 def test_infos_lose_their_masks() -> None:
-    """Only those of this step, mappings within mappings included; a key may be a number."""
     env = SingleEnv(SyncVectorEnv([_Numbered]))
     env.reset()
     assert set(env.step(0)[4]) == {"step", "deep", 7, (1, 2)}

@@ -92,7 +92,6 @@ def test_layout_and_byte_order_do_not_matter(view: np.ndarray[Any, Any]) -> None
     ],
 )
 def test_strings_that_cannot_arrive_as_they_are(array: Any, arrived: list[str]) -> None:
-    """Without a width, or with lone surrogates; the rest of the array is untouched."""
     assert through(array).tolist() == arrived
 
 

@@ -183,7 +183,6 @@ def test_description_is_bounded_printable_and_without_addresses() -> None:
 
 
 def test_failures_of_pickler_and_unpickler_are_protocol_errors() -> None:
-    """What cannot be pickled is refused with its path; what cannot be loaded, with the reason."""
     with pytest.raises(LocalProtocolError, match=r"kwargs\[.f.\]\[1\] cannot be sent"):
         encode({"kwargs": {"f": [0, lambda: 0]}}, pickler=pickle.dumps)
     with pytest.raises(RemoteProtocolError, match="cannot be loaded"):

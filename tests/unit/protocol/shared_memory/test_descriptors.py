@@ -19,7 +19,6 @@ def watch() -> Iterator[Watch]:
 
 
 def test_a_runner_hears_a_ring() -> None:
-    """However often it is rung before: a bell that nobody answers does not block."""
     bell = RunnerBell()
     for _ in range(100_000):
         bell.ring()

@@ -38,7 +38,6 @@ def sizes(leaves: tuple[slabs.Leaf, ...]) -> list[tuple[int, int]]:
 
 
 def assert_apart(areas: list[tuple[int, int]], total: int) -> None:
-    """Every area starts after the one before it has ended, aligned, and inside the slab."""
     assert all(end <= start for (_, end), (start, _) in pairwise(areas))
     assert all(start % slabs.LINE == 0 for start, _ in areas)
     assert areas[-1][1] <= total

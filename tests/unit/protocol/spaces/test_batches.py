@@ -80,7 +80,6 @@ def test_bounds_cover_everybody_once_and_evenly(count: int, data: st.DataObject)
 
 @given(NAMES, SHARDS, st.integers(0, 2**31))
 def test_split_gives_each_shard_its_members(name: str, shards: int, seed: int) -> None:
-    """The members of the slices, as Gymnasium iterates over them, are those of the batch."""
     space = SINGLE_SPACES[name]
     members, batch = batch_of(space, NUM_ENVS, seed)
     bounds = batches.even_bounds(NUM_ENVS, shards)
@@ -95,7 +94,6 @@ def test_split_gives_each_shard_its_members(name: str, shards: int, seed: int) -
 
 @given(NAMES, SHARDS, st.integers(0, 2**31))
 def test_join_is_the_batch_of_all_members(name: str, shards: int, seed: int) -> None:
-    """Joining what the shards answer gives what one process would have answered."""
     space = SINGLE_SPACES[name]
     members, batch = batch_of(space, NUM_ENVS, seed)
     parts = parts_of(space, members, batches.even_bounds(NUM_ENVS, shards))
@@ -104,7 +102,6 @@ def test_join_is_the_batch_of_all_members(name: str, shards: int, seed: int) -> 
 
 @pytest.mark.parametrize("name", SINGLE_SPACES)
 def test_batches_conform_to_their_space(name: str) -> None:
-    """A batch as Gymnasium makes it is accepted, for the right number of members only."""
     space = SINGLE_SPACES[name]
     _, batch = batch_of(space, 3)
     assert batches.conforms(space, batch, 3)

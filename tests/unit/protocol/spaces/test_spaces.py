@@ -148,7 +148,6 @@ ALL = [*BOXES, *OTHERS, *NESTED, *([OneOf([BOXES[0], OTHERS[0]])] if OneOf else 
 
 @pytest.mark.parametrize("space", ALL, ids=repr)
 def test_space_arrives_with_every_attribute(space: Space) -> None:
-    """Every class of Gymnasium arrives equal, with exact attributes and the same samples."""
     assert_crosses(space)
 
 
@@ -283,7 +282,6 @@ def test_custom_space_refuses_to_sample_and_to_judge() -> None:
 
 
 def test_custom_spaces_compare_copy_and_batch() -> None:
-    """An opaque space is equal to its own kind, and batches to a Tuple as Gymnasium's do."""
     one, other = through(CustomSpace()), through(CustomSpace())
     assert one == other == copy.deepcopy(one)
     assert len({one, other}) == 1
@@ -310,7 +308,6 @@ def nested(levels: int) -> Space:
 
 
 def test_depth_is_bounded_on_both_sides() -> None:
-    """Spaces nested too deeply are neither sent nor built; at the limit they arrive."""
     assert_crosses(nested(MAX_SPACE_DEPTH))
     with pytest.raises(LocalProtocolError, match="deeper"):
         encode_space(nested(MAX_SPACE_DEPTH + 1))

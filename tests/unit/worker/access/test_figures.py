@@ -10,7 +10,6 @@ from tests.support.processes import eventually
 
 
 def test_what_processes_use_is_added_up_by_client(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of each first one and all below it; processor time stays when they have gone."""
     monkeypatch.setattr(figures, "EVERY_S", 3600.0)
     shell = ["sh", "-c", "i=0; while [ $i -lt 200000 ]; do i=$((i+1)); done; cat; :"]
     with subprocess.Popen(shell, stdin=subprocess.PIPE) as process:
@@ -34,7 +33,6 @@ def test_what_processes_use_is_added_up_by_client(monkeypatch: pytest.MonkeyPatc
 
 
 def test_what_clients_say_cannot_make_a_label() -> None:
-    """Operations, reasons and names have their number; the rest is added up."""
     tally = figures.Tally()
     for number in range(1000):
         tally.asked(f"client {number}", f"operation {number}")

@@ -123,7 +123,6 @@ def test_a_jail_that_is_used_is_held_though_its_client_no_longer_says_so() -> No
 
 
 def test_a_session_has_so_many_connections() -> None:
-    """Each is memory of the server; the one that was unused for longest is forgotten."""
     sessions = Sessions()
     for number in range(CONNECTIONS_OF_ONE + 1):
         session = sessions.connect(b"%d" % number, b"key", b"name")

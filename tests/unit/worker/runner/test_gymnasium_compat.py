@@ -79,7 +79,6 @@ def many(n_envs: int = 2) -> gym.vector.SyncVectorEnv:
     ],
 )
 def test_results_become_tasks(returned: Any, names: list[tuple[str, Any]]) -> None:
-    """A vector environment, a single one, and suites of tasks; each is described."""
     found = tasks.tasks_of(returned(), 2, False, returned)
     assert [(one.suite, one.task) for one in found] == names
     made = manifest.describe(found)

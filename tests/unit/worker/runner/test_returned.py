@@ -142,8 +142,6 @@ def test_a_space_that_changes_is_told() -> None:
     ],
 )
 def test_what_gymnasium_accepts_is_not_refused(seen: Any, later: Any) -> None:
-    """And the results are Gymnasium's to the last bit."""
-
     def make() -> Any:
         return Returning(BOX, seen, *later)
 

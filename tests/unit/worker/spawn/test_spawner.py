@@ -101,7 +101,6 @@ def test_runners_draw_different_random_numbers(cell: Cell) -> None:
 
 @pytest.mark.parametrize("killed", [True, False])
 def test_a_runner_that_ends_takes_children_along(cell: Cell, folder: Path, killed: bool) -> None:
-    """Those of its session, and when it is killed all; others of its jail go on."""
     second = cell.start()
     mark = str(folder / "mark")
     child = f"['/bin/sh', '-c', 'sleep 1000; : {mark}'], start_new_session={killed}"

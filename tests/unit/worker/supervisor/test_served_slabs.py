@@ -91,7 +91,6 @@ def frame(*, spin_ns: int = 0, known: int = 0) -> bytes:
 
 
 def test_a_step_is_written_and_answered(served: Served) -> None:
-    """The client's words and actions arrive; what comes back is the outcome and the batch."""
     served.runner.tells[words.PARKED] = 1
     taken = served.ask()
     assert os.read(served.runner.bell, 8) == (1).to_bytes(8, "little")

@@ -95,7 +95,6 @@ def test_a_mode_that_is_not_stated_is_found_out(mode: str) -> None:
 
 @pytest.mark.parametrize(("num_envs", "episodes"), [(1, 1), (3, 10), (4, 3), (5, 5), (7, 100)])
 def test_quotas_add_up(num_envs: int, episodes: int) -> None:
-    """They are even, the first ones take the rest, and the sum is exact."""
     shares = quotas(num_envs, episodes)
     assert sum(shares) == episodes
     assert shares == sorted(shares, reverse=True)
@@ -115,7 +114,6 @@ def test_the_same_seed_gives_the_same_rollout() -> None:
 
 
 def test_max_steps_stops_and_says_so() -> None:
-    """Unfinished episodes are not counted; every state is observed once."""
     steps: list[int] = []
     given: dict[str, Any] = {"episodes": 1000, "seed": 0, "max_steps": 10}
     observe = lambda counter: steps.append(counter.steps)  # noqa: E731
@@ -127,7 +125,6 @@ def test_max_steps_stops_and_says_so() -> None:
 
 
 def test_vector_rewards_are_summed_component_by_component() -> None:
-    """Rewards of shape (num_envs, 2) give returns of two; the step after an end is no step."""
     counter = EpisodeCounter(2, 2, "SameStep")
     counter.step([[1, 2], [3, 4]], [False, True], [False, False], {})
     counter.step([[10, 20], [30, 40]], [True, True], [False, False], {})
@@ -140,7 +137,6 @@ def test_vector_rewards_are_summed_component_by_component() -> None:
 
 
 def test_only_ended_environments_are_reset_by_hand() -> None:
-    """DISABLED: the mask names those that ended, and goes away with the next step."""
     counter = EpisodeCounter(2, 4, "Disabled")
     counter.step([0, 0], [False, True], [False, False], {})
     assert counter.reset_mask.tolist() == [False, True]
@@ -190,13 +186,10 @@ def test_rewards_that_cannot_be_counted_are_refused(rewards: Any) -> None:
     ],
 )
 def test_success_is_read_where_it_is_stated(infos: Any, expected: bool | None) -> None:
-    """Of sub-environment 1; what has an unexpected form counts as not stated."""
     assert success_of(infos, 1) is expected
 
 
 def test_an_unknown_action_space_is_explained() -> None:
-    """Neither policy can make actions for a space that is not Gymnasium's."""
-
     class Own(gym.Space[Any]):
         def sample(self, *args: Any, **kwargs: Any) -> Any:
             raise gym.error.CustomSpaceError("no")

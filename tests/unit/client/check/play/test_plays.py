@@ -49,7 +49,6 @@ def walks(
 
 @pytest.mark.parametrize("mode", list(Modes))
 def test_a_film_is_of_so_many_frames(mode: Modes) -> None:
-    """Over the ends of episodes, in each mode; it can be played, and has some stills."""
     made = film(walks(mode=mode), seed=0, seconds=600)
     assert made.frames == 75
     assert film(walks(mode=mode), seed=0, seconds=0).frames == 1, "nor does it take long"

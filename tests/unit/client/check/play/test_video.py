@@ -51,7 +51,6 @@ def test_odd_sides_repeat_their_last_line() -> None:
     ids=range(8),
 )
 def test_what_is_no_frame_is_refused(rendered: Any, says: str) -> None:
-    """Wrong types, shapes and sizes, each by its name; ten thousand million pixels uncopied."""
     with pytest.raises(VideoError, match=says):
         plays.first_frame((rendered,), "rgb_array")
     for nothing in (np.zeros((0, 4, 4, 3), np.uint8), np.array(3, np.uint8), {}):
@@ -111,7 +110,6 @@ def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
 def test_targets_that_cannot_work_are_refused_early(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before any environment is run; of a missing encoder the extra that brings it is named."""
     (tmp_path / "folder.mp4").mkdir()
     with pytest.raises(VideoError):
         plays.check_target(tmp_path / name)
@@ -136,8 +134,6 @@ def test_views_of_every_kind_are_frames(tmp_path: Path, picture: Any) -> None:
 
 
 def test_an_environment_that_cannot_render_says_what_to_do() -> None:
-    """Whatever its ``render`` raises is told, with what a video needs."""
-
     class Blind:
         render_mode = None
 

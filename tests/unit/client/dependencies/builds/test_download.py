@@ -48,7 +48,6 @@ def target(tmp_path: Path) -> Path:
 
 
 def test_the_files_of_a_commit(url: str, repository: Path, target: Path) -> None:
-    """By a tag, which means its commit; not those of the newest. A full commit means itself."""
     found = download.resolve(url, "v1")
     assert found == run_git(repository, "rev-parse", "v1^{commit}")
     download.check_out(url, found, target, print)

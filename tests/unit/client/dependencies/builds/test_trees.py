@@ -22,7 +22,6 @@ from tests.support.packages.sdists import add, make_sdist
 def packed(
     tmp_path: Path, *members: tuple[str, bytes, bytes], name: str = "x-1.0.tar.gz", **options: Any
 ) -> Path:
-    """An archive of these: name, content and kind."""
     path = tmp_path / name
     with tarfile.open(path, "w:gz", format=tarfile.PAX_FORMAT, **options) as archive:
         for name, data, kind in members:

@@ -164,7 +164,6 @@ def wheel(tmp_path: Path) -> Path:
 
 
 def test_what_is_kept_is_found_again(wheel: Path) -> None:
-    """For the same source and interpreter, with what it was built of; no login is kept."""
     assert wheels.recall(SOURCE, PYTHON) is None
     kept = wheels.keep(wheel, SOURCE, "e" * 64, PYTHON)
     assert kept == wheels.recall(SOURCE, PYTHON)

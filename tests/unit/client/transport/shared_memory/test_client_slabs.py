@@ -53,7 +53,6 @@ def write(slab: ObservationSlab, value: int) -> None:
 
 
 def test_one_slot_is_copied_out(slab_of: Callable[..., ObservationSlab]) -> None:
-    """In the structure of the space; what comes later does not reach the caller's arrays."""
     slab = slab_of(NESTED)
     assert slab.choose() == 0
     write(slab, 1)

@@ -100,8 +100,6 @@ def test_v2_processes_in_the_way_move_to_a_leaf(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("refused", ["memory.limit_in_bytes", "memory.max", "pids.max"])
 def test_group_that_cannot_be_limited_is_not_left_behind(tmp_path: Path, refused: str) -> None:
-    """Whichever of its limits the kernel refuses."""
-
     def write(path: str, text: str) -> None:
         if path.endswith(f"/{refused}"):
             raise PermissionError(path)

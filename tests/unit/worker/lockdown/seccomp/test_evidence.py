@@ -78,7 +78,6 @@ def test_what_is_not_its_own_is_told(
 
 
 def test_a_path_starts_where_its_caller_stands(tmp_path: Path) -> None:
-    """Or from the folder whose descriptor it names; what is no folder makes no path."""
     folder = os.open(tmp_path, os.O_RDONLY)
     ends = os.pipe()
     try:

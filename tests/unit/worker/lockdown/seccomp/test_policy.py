@@ -50,7 +50,6 @@ class Filter:
         )
 
     def __call__(self, name: str, *args: int) -> int:
-        """The verdict for the call ``name`` with ``args``."""
         return run(self.program, ARCH[self.machine], NUMBERS[self.machine][name], args)
 
 
