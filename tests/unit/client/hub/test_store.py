@@ -46,9 +46,7 @@ def published(slot: store.Slot) -> store.Slot:
     return slot
 
 
-def test_what_another_puts_there_meanwhile_is_not_damaged(
-    published: store.Slot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_just_came_is_whole(published: store.Slot, monkeypatch: pytest.MonkeyPatch) -> None:
     elsewhere, exists = published.home.with_name("elsewhere"), os.path.lexists
     published.home.rename(elsewhere)
 

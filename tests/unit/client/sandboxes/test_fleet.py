@@ -88,9 +88,7 @@ BUSY = errors.ServerBusyError("a: no room")
         (errors.PolicyError("not permitted"), False),
     ],
 )
-def test_a_full_or_absent_place_is_followed_by_another(
-    error: errors.EnvHubError, elsewhere: bool
-) -> None:
+def test_the_next_follows_a_full_or_absent_one(error: errors.EnvHubError, elsewhere: bool) -> None:
     """What would be the same elsewhere is not tried again, or is a mistake to be known."""
     assert may_go_elsewhere(error) is elsewhere
 

@@ -117,9 +117,7 @@ def test_network_is_reported_as_chosen() -> None:
         (replace(STRICT, network="lan"), USER, "network"),
     ],
 )
-def test_missing_layer_is_an_error_with_a_fix(
-    confinement: Confinement, facts: dict[str, Any], layer: str
-) -> None:
+def test_missing_layer_has_fix(confinement: Confinement, facts: dict[str, Any], layer: str) -> None:
     with pytest.raises(LayerUnavailableError) as raised:
         plan(confinement, **facts)
     assert raised.value.layer == layer

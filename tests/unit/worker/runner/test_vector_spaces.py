@@ -144,9 +144,7 @@ def test_of_a_class_only_the_first_is_reset() -> None:
         (np.zeros((3, 2)), {}, "single_action_space"),
     ],
 )
-def test_what_cannot_be_derived_is_named(
-    observation: Any, attributes: dict[str, Any], missing: str
-) -> None:
+def test_the_underived_is_named(observation: Any, attributes: dict[str, Any], missing: str) -> None:
     with pytest.raises(MissingSpaceError, match=missing):
         spaces_of(vector(observation, **attributes), {})
 

@@ -72,9 +72,7 @@ def test_far_branch_becomes_a_pair_of_jumps(both: bool) -> None:
     ],
     ids=["a label behind its branch", "a missing label", "too long"],
 )
-def test_what_the_kernel_would_refuse_is_refused(
-    items: list[Any], error: type[Exception], text: str
-) -> None:
+def test_what_no_kernel_takes_fails(items: list[Any], error: type[Exception], text: str) -> None:
     with pytest.raises(error, match=text):
         assemble(items)
 

@@ -111,9 +111,7 @@ WITHOUT_EFFECT = """
     [(DENIED, EPERM), (ABSENT, ENOSYS), (WITHOUT_EFFECT, PRETEND)],
     ids=["denied", "absent", "without"],
 )
-def test_what_no_library_needs_never_reaches_the_kernel(
-    machine: str, namespaced: bool, names: str, verdict: int
-) -> None:
+def test_nothing_needless_passes(machine: str, namespaced: bool, names: str, verdict: int) -> None:
     check = Filter(machine, namespaced, "host")
     for name in names.split():
         for arguments in ((), (0,), (1, 2, 3, 4, 5, 6)):
