@@ -1,1 +1,1 @@
-"""One environment's life in jails: opened, asked, survived, closed. Knows no Gymnasium face."""
+"""The life of one environment in jails: starts, requests, deaths, close. Knows no Gymnasium."""

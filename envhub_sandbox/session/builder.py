@@ -1,8 +1,8 @@
-"""Where an environment gets its jail from, and how it is built there.
+"""Takes a jail for an environment, and builds the environment in it.
 
-``JailSource`` gives each task that is in use a jail, so that closing it frees its processes. Where
-``make_env`` has built all environments at once, they live in one ``SharedJail``. ``Builder`` builds
-a slice in each runner, and opens the lane to them.
+``JailSource`` opens a jail for each task that is in use, so that closing the task frees its
+processes. If ``make_env`` built all environments at once, they live in one ``SharedJail``.
+``Builder`` builds a slice of the sub-environments in each runner, and opens the lane to them.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from envhub_sandbox.transport.lane import Lane
 
 _LONGEST = 8192
-"""Characters of an error that shows spaces."""
+"""The most characters of an error that shows spaces."""
 _numbers = itertools.count(1)
 
 
 class JailSource:
     """Gives each environment a jail of its own, and takes it back.
-    ``forget_manifest``: drops the remembered manifest, when a jail contradicts it.
-    ``expected``: what such a jail is going to be.
+    ``forget_manifest``: drops the remembered manifest when a jail contradicts it.
+    ``expected``: the manifest that the jail is expected to return.
     ``shared``: whether several environments live in one jail.
     """
 
@@ -53,22 +53,22 @@ class JailSource:
         self._expected = expected
 
     def take(self, deadline: Deadline) -> LoadedJail:
-        """A jail for one environment."""
+        """Open a jail for one environment."""
         return self.launcher.open(deadline, self._expected)
 
     def end(self, loaded: LoadedJail) -> None:
-        """End the jail now, over another connection: a thread may wait on its own."""
+        """End the jail now, over another connection, since a thread may wait on the jail's own."""
         self.launcher.interrupt(loaded)
 
     def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
-        """Give a jail back; with ``wait``, until nothing of it is left."""
+        """Give a jail back; with ``wait``, wait until all of its processes have ended."""
         self.launcher.close(loaded, wait=wait)
 
 
 class SharedJail(JailSource):
     """One jail for all environments of a repository, each with a connection of its own.
 
-    A death or a time-out of one environment takes the others' process along: they share it. A dead
+    The environments share its process, so a death or a timeout of one ends it for all. A dead
     jail is closed after its last user has left it: its server tells each of them how it ended.
     """
 
@@ -76,7 +76,7 @@ class SharedJail(JailSource):
 
     def __init__(self, launcher: Launcher, forget_manifest: Callable[[], None]) -> None:
         super().__init__(launcher, forget_manifest)
-        launcher.plays = False  # what came of that is in the manifest
+        launcher.plays = False  # the manifest already says whether sub-environments are independent
         self._lock = threading.RLock()  # interruption.md, rule 12
         self._owner = OwnerProcess()
         self._first: LoadedJail | None = None
@@ -84,13 +84,13 @@ class SharedJail(JailSource):
         self._users: weakref.WeakSet[LoadedJail] = weakref.WeakSet()
 
     def provide(self, loaded: LoadedJail) -> None:
-        """Start with a jail that is loaded already."""
+        """Use a jail that is loaded already as the shared jail."""
         self._first = loaded
-        # interruption.md, rule 13; it may never be taken, nor closed
+        # interruption.md, rule 13; no environment may ever take the jail, nor close it
         weakref.finalize(self, self.launcher.close, loaded).atexit = False
 
     def take(self, deadline: Deadline) -> LoadedJail:
-        """A connection to the jail, which is opened if there is none that lives."""
+        """Connect to the jail; open it first if none lives."""
         with self._lock:
             if self._first is not None and not self.launcher.lives(self._first):
                 self._leave_first()
@@ -113,7 +113,7 @@ class SharedJail(JailSource):
                     self.launcher.close(first)
 
     def give_back(self, loaded: LoadedJail, *, wait: bool = True) -> None:
-        """Drop a connection; with its last one a jail ends."""
+        """Close a connection to a jail; the last one also ends the jail."""
         self.launcher.disconnect(loaded)
         loaded.jail.watched.forget()  # a lost reply may have named changed attributes
         with self._lock:
@@ -144,8 +144,8 @@ class SharedJail(JailSource):
 
 
 class Builder:
-    """Builds one environment, again after each restart.
-    ``results``: what the environment is expected to be, and its slices, one for each shard.
+    """Builds one environment, and builds it again after each restart.
+    ``results``: the expected manifest of the environment, and its slices, one for each shard.
     """
 
     def __init__(self, jails: JailSource, results: Results) -> None:
@@ -155,16 +155,19 @@ class Builder:
         self._results = results
         self._manifest = results.manifest
         self._bounds = results.bounds
-        # runners of a jail that several environments share die with it, for all of them
+        # a shared jail ends with the first runner that dies: only an own jail can be kept
         self._own = not jails.shared
         self._keeps = self._own and jails.launcher.repository.policy.restart == "transparent"
-        self._number = next(_numbers)  # in every jail: what was packed for one, another understands
+        self._number = next(_numbers)  # the same in every jail, so messages can be packed once
 
     def build(self, loaded: LoadedJail, deadline: Deadline) -> Lane:
         """Build the environment in a loaded jail; returns the lane to its runners.
-        Raises ``LoadError``: ``make_env`` returned something else than before; ``WorkerError``: the
-        jail died, or took too long.
+        Raises ``LoadError``: ``make_env`` returned another environment than before;
+        ``WorkerError``: the jail died, or took too long.
         """
+        # The manifest is checked twice: first the remembered one, before any work, and again after
+        # ``spread``, where further runners may have returned something else. Only then the shards
+        # are built, and the lane is opened last, since it attaches to environments that exist.
         self._check_manifest(loaded)
         if self._keeps and not loaded.jail.kept:
             loaded.jail.keep(deadline)
@@ -180,9 +183,9 @@ class Builder:
     def rebuild(
         self, loaded: LoadedJail, lane: Lane, dead: Sequence[int], deadline: Deadline
     ) -> None:
-        """Build some shards again, each in a fresh runner of the same jail.
+        """Build dead shards again, each in a new runner of the same jail.
         Raises ``LoadError`` or ``RemoteEnvError``: the repository failed this time;
-        ``WorkerError``: they died again, or took too long.
+        ``WorkerError``: the new runners died too, or took too long.
         """
         gone = [lane.runners[index] for index in dead]
         fresh = loaded.jail.replace_runners(gone, deadline)
@@ -213,7 +216,7 @@ class Builder:
         spaces = [_spaces(self._manifest)]
         for index, reply in zip(shards, replies, strict=True):
             if type(reply) is not m.BuildDone:
-                self._refuse_differing(spaces)  # which in one process comes first
+                self._refuse_differing(spaces)  # this error comes first in one process, too
             check_reply(reply)
             built = typed_reply(reply, m.BuildDone)
             spaces.append(self._check_built(built, *self._bounds[index]))
@@ -222,20 +225,20 @@ class Builder:
             self.take_apart(relay, shards, deadline)
 
     def take_apart(self, lane: Lane, shards: Sequence[int], deadline: Deadline) -> None:
-        """Have each sub-environment's infos come as it gives them: see ``Results.apart``."""
+        """Have the runners return infos apart, as ``Results.apart`` says."""
         message = m.TakeApart(lane.number)
         requests: list[tuple[int, m.Message]] = [(lane.runners[shard], message) for shard in shards]
         for reply in lane.jail.exchange("make_env", requests, deadline):
             typed_reply(reply, m.Value)
 
     def _check_built(self, reply: m.BuildDone, start: int, stop: int) -> Pair:
-        """Compare what was built with the manifest; returns the spaces of one sub-environment.
+        """Compare the built environment with the manifest; returns its single spaces.
         Trust: input from the worker.
         """
         most = self._repository.policy.limits.elements
         built, wanted = decode_env(reply.manifest, max_elements=most), self._manifest
         count = stop - start if wanted.shardable else wanted.num_envs
-        differs = start == 0 and _spaces(built) != _spaces(wanted)  # they describe the first
+        differs = start == 0 and _spaces(built) != _spaces(wanted)  # it describes the first
         if built.num_envs != count or built.autoreset_mode != wanted.autoreset_mode or differs:
             self._refuse()
         return _spaces(built)
@@ -246,17 +249,17 @@ class Builder:
             raise remote_error("RuntimeError", "RuntimeError", printable(text, _LONGEST))
 
     def _fast_lane(self, relay: Lane, loaded: LoadedJail, deadline: Deadline) -> Lane:
-        """Agree with the runners on slabs and doorbells; the relay where there can be none.
+        """Open the fastest lane that server and runners support; else return the relay.
 
-        This is the one place that decides which lane an environment has.
+        Only this function decides which lane an environment has.
         """
         server = loaded.server
         if server.fd_path is None or self._repository.policy.lane == "frames":
             from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 
-            # a server has the slabs of one environment for each runner
+            # the server has room for the slabs of one environment for each runner
             return (ServedLane.open(relay, deadline) if self._own else None) or relay
-        # late, for Linux alone has what they import
+        # imported late: only Linux has these modules' dependencies
         from envhub_sandbox.transport.shared_memory.attachment import Attachment
         from envhub_sandbox.transport.shared_memory.client_slabs import RING
         from envhub_sandbox.transport.shared_memory.column_lane import ColumnLane

@@ -1,7 +1,7 @@
-"""Counters of the environments: cheap to keep, and summed up only when they are read.
+"""Counters of environments, which are cheap to update and summed only when read.
 
-``LEDGER`` has those of all environments of this process, so that ``integrations/metrics.py`` sees
-counts that only grow, also when environments are closed.
+``LEDGER`` keeps the counters of all environments of this process, also of closed ones, so that the
+counts in ``integrations/metrics.py`` only grow.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     from envhub_sandbox.transport.lane import Lane
 
 KEPT = 1024
-"""Step latencies that are kept: the last ones. A power of two."""
+"""The number of last step latencies to keep. A power of two."""
 
 
 class Counters:
-    """What has happened to one environment.
+    """Counts the requests, deaths, restarts and traffic of one environment.
 
     Attributes:
-        timeouts: Replies that were late.
-        deaths: Processes that ended under a request.
-        restarts: Fresh processes after deaths.
+        timeouts: The number of late replies.
+        deaths: The number of processes that ended during a request.
+        restarts: The number of restarts after deaths.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Counters:
         self._before = (0, 0, 0)
 
     def stepped(self, elapsed_ns: int) -> None:
-        """A step has been answered."""
+        """Count an answered step and its latency."""
         self._latencies[self.steps & (KEPT - 1)] = elapsed_ns
         self.steps += 1
         self._total_ns += elapsed_ns
@@ -68,7 +68,7 @@ class Counters:
         return {**numbers, "step_latency_s": {**self._percentiles(), "total": seconds}}
 
     def numbers(self) -> dict[str, float]:
-        """Everything that only grows; ``step_seconds`` is the sum of all step latencies."""
+        """The counts that only grow; ``step_seconds`` is the sum of all step latencies."""
         stale, sent, received = self._traffic()
         return {
             "requests": self.requests,
@@ -95,7 +95,7 @@ class Counters:
 
 
 _ONCE = ("requests", "steps", "step_seconds")
-"""Counted for the whole; all else is the sum of the workers'."""
+"""Counts of the whole environment; the other counts are sums over the workers."""
 _OF_EACH = (
     *("steps", "timeouts", "deaths", "restarts"),
     *("stale_replies", "sent_bytes", "received_bytes"),
@@ -103,7 +103,7 @@ _OF_EACH = (
 
 
 class FleetCounters(Counters):
-    """What has happened to all parts: see ``Counters``."""
+    """The counters of an environment over several workers: see ``Counters``."""
 
     def __init__(self, parts: Sequence[Counters]) -> None:
         super().__init__()
@@ -112,18 +112,18 @@ class FleetCounters(Counters):
         self._longest_ns = [0] * len(parts)
 
     def waited(self, worker: int, elapsed_ns: int) -> None:
-        """Add the time that a step waited for this worker alone, after those before it."""
+        """Add the time that a step waited for this worker, after earlier ones had answered."""
         self._waited_ns[worker] += elapsed_ns
         if elapsed_ns > self._longest_ns[worker]:
             self._longest_ns[worker] = elapsed_ns
 
     def numbers(self) -> dict[str, float]:
-        """See ``Counters``."""
+        """The counts of the whole environment; see ``Counters``."""
         own, parts = super().numbers(), [part.numbers() for part in self._parts]
         return {n: own[n] if n in _ONCE else sum(part[n] for part in parts) for n in own}
 
     def of_worker(self, worker: int) -> dict[str, Any]:
-        """Those of one worker; a straggler is the one that steps have waited for most."""
+        """The counts of one worker; ``waited_s`` shows how long steps waited for it."""
         numbers = self._parts[worker].numbers()
         waited = {"total": self._waited_ns[worker], "max": self._longest_ns[worker]}
         return {
@@ -136,7 +136,7 @@ class FleetCounters(Counters):
 
 
 class Labels(NamedTuple):
-    """What identifies a row of numbers."""
+    """The repository, suite and task of a row of numbers."""
 
     repository: str
     suite: str
@@ -147,9 +147,9 @@ class Row(NamedTuple):
     """The numbers of all environments with the same labels.
 
     Attributes:
-        numbers: ``Counters.numbers``, of the living and of those that are gone.
-        states: How many of the living are in each state.
-        latencies_s: The last step latencies of the living.
+        numbers: The sums of ``Counters.numbers``, over living and deleted environments.
+        states: The number of living environments in each state.
+        latencies_s: The last step latencies of the living environments.
     """
 
     labels: Labels
@@ -159,27 +159,27 @@ class Row(NamedTuple):
 
 
 class HasState(Protocol):
-    """A ``Lifecycle``, or that of several workers."""
+    """A ``Lifecycle``, or the ``FleetLifecycle`` of several workers."""
 
     @property
     def state(self) -> State:
-        """Where the environment is."""
+        """The state of the environment."""
 
 
 class Ledger:
-    """The counters of all environments, living and gone. Thread-safe."""
+    """The counters of all environments of this process, also of deleted ones. Thread-safe."""
 
     def __init__(self) -> None:
         self.forget()
 
     def forget(self) -> None:
-        """Drop all: in a fork, the environments are those of its parent."""
+        """Drop all counters; called in a fork, since its environments belong to the parent."""
         self._lock = threading.RLock()  # interruption.md, rule 12
         self._living: dict[int, tuple[Labels, Counters, HasState]] = {}
         self._gone: dict[Labels, dict[str, float]] = {}
 
     def add(self, env: object, labels: Labels, counters: Counters, lifecycle: HasState) -> None:
-        """Add an environment. Its counts stay when it goes."""
+        """Add an environment. Its counts stay after it is deleted."""
         key = id(env)
         with self._lock:
             self._living[key] = labels, counters, lifecycle
@@ -193,7 +193,7 @@ class Ledger:
                 _add(self._gone.setdefault(labels, {}), counters.numbers())
 
     def rows(self) -> list[Row]:
-        """A row for each set of labels."""
+        """One row for each set of labels."""
         with self._lock:
             living = list(self._living.values())
             rows = {labels: Row(labels, dict(n), {}, []) for labels, n in self._gone.items()}

@@ -1,9 +1,9 @@
-"""One task's environment: its life, from the first jail to the last.
+"""The life of one environment, from its first jail to its last.
 
 A session has a ``Lease`` (its jail, and the lane there), a ``UseLock`` (one thread at a time), a
 ``Prewarm`` (its start), ``Requests`` (for ``vector_env``) and, with ``restart="transparent"``, a
-``Recovery``. None of these knows the session, which recovers before a reset, closes, and is
-abandoned in a fork, by the rules of docs/internals/interruption.md.
+``Recovery``. None of these knows the session. The session itself recovers before a reset, closes,
+and refuses all use in a fork, by the rules of docs/internals/interruption.md.
 """
 
 from __future__ import annotations
@@ -41,22 +41,22 @@ from envhub_worker.protocol.manifest.manifest import EnvManifest
 
 _USAGE = ("processes", "threads", "files", "memory_bytes")
 _MOST = 1 << 63
-"""A limit for plausible counts: a server on another host may send any number."""
+"""The limit of plausible counts, since a server on another host may send any number."""
 GRACE_S = 2.0
 """How long ``reset`` waits for a late reply before it gives the jail up and starts another."""
 
 
 class EnvSession:
-    """The life of one vector environment, in one jail at a time, or none.
+    """The life of one vector environment, which has at most one jail at a time.
 
-    Safe to use from one thread at a time; ``close`` may come from any thread at any time, and from
-    a signal handler.
+    One thread at a time may use it; any thread and any signal handler may call ``close`` at any
+    time.
 
     Args:
         bounds: The slices of its sub-environments, one for each shard.
-        trials: Remembers how long its steps took.
-        whole: The recorder of the whole environment, if this is one worker of a fleet, which then
-            is counted instead of its workers.
+        trials: Remembers the time of its steps.
+        whole: The recorder of the whole environment if this session is one worker of several, in
+            which case the whole environment is counted, not this worker.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class EnvSession:
         _living.add(self)
 
     jails = 1
-    """How many jails it has at a time."""
+    """The number of jails that it uses at a time."""
 
     @property
     def rows(self) -> tuple[int, int]:
@@ -105,7 +105,7 @@ class EnvSession:
 
     @contextmanager
     def naming(self) -> Iterator[None]:
-        """Say in errors which sub-environments of a fleet they are of, and where these run."""
+        """Add to errors which sub-environments they concern, and where these run."""
         try:
             yield
         except EnvHubError as error:
@@ -113,7 +113,7 @@ class EnvSession:
             raise
 
     def name_in(self, error: EnvHubError) -> None:
-        """Add these to the error's text, once, unless the repository or the caller caused it."""
+        """Add this worker's rows and place to an error, unless repository or caller caused it."""
         if isinstance(error, (RemoteEnvError, LocalProtocolError)) or not error.args:
             return
         start, stop = self.rows
@@ -125,23 +125,23 @@ class EnvSession:
             error.args = ("\n".join([f"{first} {position}", *rest]), *error.args[1:])
 
     def usage(self) -> dict[str, int]:
-        """What its jail holds, as its server counts it; empty if it does not say."""
+        """What its jail uses, as counted by the server; empty if the server does not say."""
         status = self.lease.status()
         counts = {name: status.get(name) for name in _USAGE}
         valid = all(type(count) is int and 0 <= count < _MOST for count in counts.values())
         return cast("dict[str, int]", counts) if valid else {}
 
     def stats(self) -> dict[str, Any]:
-        """Counters, and its state."""
+        """The counters and the state."""
         return {**self.counters.snapshot(), "state": self.lifecycle.state.name}
 
     @property
     def may_take_apart(self) -> bool:
-        """Whether ``take_apart`` can ask the processes now, or there are none."""
+        """Whether ``take_apart`` can ask the processes now, or needs to ask none."""
         return self.lease.lane is None or self.lifecycle.state is State.READY
 
     def take_apart(self, deadline: Deadline) -> bool:
-        """Have infos come as each sub-environment gives them, if possible: ``Results.apart``."""
+        """Have infos come apart, as ``Results.apart`` says; returns whether they do."""
         with self.use.hold("make_env"):
             if not self.lease.results.apart and self.may_take_apart:
                 self.lease.take_apart(deadline)
@@ -150,18 +150,26 @@ class EnvSession:
     # --- recovery --------------------------------------------------------------------------------
 
     def recover(self, grace: Deadline | None = None) -> None:
-        """Before a reset, catch up with a late reply, or give up the jail that owes it.
+        """Before a reset, take a late reply, or give up the jail that owes it.
 
         A reply whose wait was interrupted counts as late. After a death, a fresh jail is started
         only if the policy says ``restart="on_reset"``.
-        ``grace`` is how long to wait for late replies; several workers share it.
+        ``grace`` bounds the wait for late replies; several workers share one.
         """
         ready = self.lifecycle.state is State.READY and not self.prewarm.unused
         if ready and self.repository.timeouts.idle_s is None:
             return
         with self.use.hold("reset"):
-            # The order matters. What ended unnoticed becomes EXPIRED first. A reply that is still
-            # pending here belongs to an interrupted request, since this thread has the lock.
+            # The order matters, since each step may move the state to one that a later step
+            # handles:
+            #
+            # 1. A jail that was started ahead and has died unnoticed becomes EXPIRED.
+            # 2. PENDING becomes LATE: this thread holds the lock, so the pending request was
+            #    interrupted.
+            # 3. READY becomes EXPIRED if the server has ended an idle jail.
+            # 4. EXPIRED becomes IDLE; the next request opens a new jail.
+            # 5. LATE becomes READY if the reply still comes, otherwise IDLE.
+            # 6. DEAD becomes IDLE, at the cost of one restart.
             self.prewarm.look_whether_it_lives()
             if self.lifecycle.state is State.PENDING:
                 self._failures.note_interruption()
@@ -176,7 +184,7 @@ class EnvSession:
                 self._forget()
 
     def notice_death(self) -> None:
-        """Before a reset, after the death of another worker, find out whether this one died too."""
+        """Before a reset, after another worker has died, check whether this worker died too."""
         if self.lifecycle.state is State.READY:
             with self.use.hold("reset"):
                 try:
@@ -189,10 +197,10 @@ class EnvSession:
         try:
             if lane is None or request is None:
                 raise WorkerError("the jail was given up, or how far the request came is not known")
-            self.lease.forget_watched()  # also where it was interrupted before the wait
+            self.lease.forget_watched()  # an interrupt may have come before the wait
             lane.catch_up(grace)
         except RunnersDiedError:
-            pass  # the reset that follows meets them
+            pass  # the reset that follows handles the deaths
         except (WorkerDiedError, WorkerTimeoutError) as error:
             error.request = request
             self._failures.keep_crash(error)
@@ -209,10 +217,10 @@ class EnvSession:
         except WorkerDiedError as error:
             if error.reason == "idle":
                 self.lifecycle.moved(Event.EXPIRY)
-        # any other death is met by the reset that follows
+        # the reset that follows handles any other death
 
     def _forget(self) -> None:
-        """Give up the jail; the next request opens another, in the same server."""
+        """Give up the jail; the next request opens a new one in the same server."""
         WORKER.info("%s: the jail is given up for a fresh one", self.repository.label)
         self.lease.leave()
         self.lifecycle.request = None
@@ -234,13 +242,18 @@ class EnvSession:
         if not self.use.lock.acquire(blocking=False):
             self._interrupt()
             return
-        # interruption.md, rules 7, 9 and 11. The lock is free, so no request runs. CLOSED comes
-        # first: from then on no other thread starts anything. What steps took is noted while the
-        # lane is still there. Then the repository's own ``close`` may run, but only if no reply is
-        # owed: a runner that is busy would not answer in time. Then the jail is given back. The
-        # lock is released whatever fails, or every later ``close`` would take this one for a
-        # running request. After an interrupt the state is CLOSED, and the next ``close`` goes on in
-        # ``_finish``.
+        # interruption.md, rules 7, 9 and 11. This thread has taken the lock, so no request runs.
+        # The order matters:
+        #
+        # 1. The state becomes CLOSED: from then on no other thread starts anything.
+        # 2. The time of steps is noted while the lane still exists.
+        # 3. The repository's own ``close`` runs, but only if no reply is owed: a busy runner would
+        #    not answer in time.
+        # 4. The jail is given back.
+        # 5. The lock is released whatever fails, or every later ``close`` would take this one for
+        #    a running request.
+        #
+        # After an interrupt the state is CLOSED, and the next ``close`` continues in ``_finish``.
         try:
             state = self.lifecycle.state
             self._end_life()
@@ -254,7 +267,7 @@ class EnvSession:
                 self.use.lock.release()
 
     finalize = close
-    """What a finalizer calls."""
+    """The function for a finalizer to call."""
 
     def _finish(self) -> None:
         if self.use.lock.acquire(blocking=False):  # else another thread is closing it
@@ -268,25 +281,28 @@ class EnvSession:
         self._restarts.give_up()
 
     def _interrupt(self) -> None:
-        """End the jail whose reply another thread waits for, then clean up: interruption.md, rule
-        11. If that thread does not release the lock in time, it cleans up itself.
+        """End the jail whose reply another thread waits for, then give it back: interruption.md,
+        rule 11. If that thread does not release the lock in time, it gives the jail back itself.
         """
-        # The other thread holds the lock and may wait without end, so we cannot wait for the lock
-        # first. CLOSED and the end of the jail are one act under the lease's own lock: a thread
-        # that takes a jail at this moment either sees CLOSED and gives it back, or has noted it and
-        # finds it ended. The end of the jail wakes that thread, which releases the lock. Only then
-        # do we have the lock and clean up; no longer than ``patience_s``, as ``close`` is bounded.
+        # The other thread holds the lock and may wait without end. So the order is:
+        #
+        # 1. Under the lease's own lock, the state becomes CLOSED and the jail is ended. A thread
+        #    that is taking a jail at this moment either sees CLOSED and gives its jail back, or
+        #    has noted the jail, which is then ended.
+        # 2. The end of the jail wakes the other thread, which releases the environment's lock.
+        # 3. We take that lock, waiting for at most ``patience_s`` because ``close`` is bounded,
+        #    and give back what is left.
         if not self.lease.interrupt(self._end_life):
-            # The other thread sees CLOSED where it takes a jail; it may be past that, so the server
-            # is released here.
+            # The other thread checks for CLOSED when it has taken a jail, but it may have passed
+            # that check already, so the server is released here.
             self.lease.depart()
             return
         close_s = self.repository.timeouts.close_s
         patience_s = INTERRUPT_S if close_s is None else min(close_s, INTERRUPT_S)
         if self.use.lock.acquire(timeout=patience_s):
             try:
-                self.lifecycle.moved(Event.CLOSE)  # the other may have moved at the same moment
-                self.lease.let_go()  # of what is there now: it may have moved elsewhere, too
+                self.lifecycle.moved(Event.CLOSE)  # the other thread may have moved it
+                self.lease.let_go()  # also of a jail that the other thread took meanwhile
             finally:
                 self.use.lock.release()
 

@@ -1,12 +1,12 @@
-"""What is added to the text of an error: the author's own line, advice, and what was denied.
+"""Adds to the text of an error: the repository's own line, advice, and denials.
 
-A worker names files relative to its repository. Here they get the names that their author knows:
-the path in the local folder, or the file at that commit, but never the copy in the store. The
-verified snapshot decides about these names, not the worker.
+A worker names files relative to its repository. Here they get the names that the author knows: the
+path in the local folder, or the file at that commit, never the copy in the store. The verified
+snapshot determines these names, not the worker.
 
-Errors of downloads, sockets and windows get advice: a jail has no network and no display, and what
-libraries say then ("check your Internet connection") does not help. Trust: the worker's text only
-selects one of our sentences.
+Errors of downloads, sockets and windows get advice: a jail has no network and no display, and the
+texts of libraries ("check your Internet connection") do not help there. Trust: the worker's text
+only selects one of our sentences.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _FUNCTION_CHARS, _SOURCE_CHARS = 100, 200
 
 
 def add_author_line(error: EnvHubError, snapshot: Snapshot) -> None:
-    """Add the repository's own line to what it raised, once. Trust: text from the worker."""
+    """Add the repository's own line to its error, once. Trust: text from the worker."""
     remote = error if isinstance(error, RemoteEnvError) else error.__cause__
     if not isinstance(remote, RemoteEnvError) or "__notes__" in vars(error):
         return
@@ -57,7 +57,7 @@ def _place(frame: re.Match[str], snapshot: Snapshot) -> str | None:
 
 
 def _name(frame: re.Match[str], snapshot: Snapshot) -> str:
-    """Of a file in the repository; older workers give its whole path."""
+    """The path of a frame's file in the repository; older workers send the absolute path."""
     return frame["file"].removeprefix(f"{snapshot.root}/")
 
 
@@ -75,7 +75,7 @@ def _line(frame: re.Match[str], snapshot: Snapshot) -> str:
 
 
 def _source(frame: re.Match[str]) -> list[str]:
-    """The source line and, for a syntax error, the caret below it, which Python indents alike."""
+    """The source line and, for a syntax error, the caret line, with the same indentation."""
     source = (frame["source"] or "").replace("\t", " ")
     text = source.lstrip(" |")
     shown = one_line(text.rstrip(" |"), _SOURCE_CHARS)
@@ -94,7 +94,7 @@ _INSTALL = r"\b(pip|pip3|uv|conda)\b[^\n]{0,80}\b(install|add|sync)\b"
 _REQUIREMENT = (
     r"(?<![\w.-])[A-Za-z0-9](?:[\w.-]{0,98}[A-Za-z0-9])?(?:\[[\w.,-]{1,99}\])?"
     r"(?:[<>=!~][\w.*,<>=!~]{0,99}[\w*])?(?![\w+:/@])"
-)  # read in one way only: in two, what a list of them costs doubles with each
+)  # unambiguous: with two ways to match, each item would double the time
 _COMMAND = (
     r"(?P<quote>[`'\"]?)(?:python3? -m )?\b(?:pip3?|uv(?: pip)?|conda) (?:install|add) "
     rf"(?:(?:-U|-q|--upgrade|--quiet|--user|-y) )*['\"]?(?P<first>{_REQUIREMENT})['\"]?"
@@ -171,12 +171,12 @@ _ADVICE: tuple[tuple[str, dict[str, tuple[str, ...]], str], ...] = (
         "package, only a folder of your own with the file and an env.py can have it",
     ),
 )
-"""What a text says, the values of a policy with which that is no wonder, and what to do."""
+"""A pattern in an error's text, the policy's values that explain it, and the advice."""
 _TEXT_CHARS = 65_536
 
 
 def add_reach_advice(error: EnvHubError, policy: Policy) -> bool:
-    """Add what to do to an error of a download, a socket or a window, once; whether it is one."""
+    """Add advice to an error of a download, a socket or a window, once; whether it is one."""
     remote = error if isinstance(error, RemoteEnvError) else error.__cause__
     if "__notes__" in vars(error):
         return False
@@ -191,7 +191,7 @@ def add_reach_advice(error: EnvHubError, policy: Policy) -> bool:
 
 
 def _advice(text: str, policy: Policy, patterns: Collection[str] = ()) -> str:
-    """The sentence of the first row that fits; ``patterns``: of these rows alone."""
+    """The sentence of the first row of advice that fits, of the rows in ``patterns`` if any."""
     for pattern, granted, sentence in _ADVICE:
         applies = all(getattr(policy, name) in values for name, values in granted.items())
         if applies and pattern in (patterns or (pattern,)) and re.search(pattern, text):
@@ -207,7 +207,7 @@ def _advice(text: str, policy: Policy, patterns: Collection[str] = ()) -> str:
 
 
 def _to_install(text: str) -> list[str]:
-    """The packages of a command that a text quotes."""
+    """The packages in an install command that a text quotes."""
     command = re.search(_COMMAND, text.replace("', '", " "))
     if command is None:
         return ["PACKAGE"]
@@ -225,13 +225,13 @@ _NOT_FOUND = (
 )
 _MOST_NAMES, _DEEPEST = 16, 16
 _NAMED_CHARS = 4096
-"""How much of a worker's text is searched for names, which takes time."""
+"""The characters of a worker's text to search for names, since the search takes time."""
 
 
 def why_missing(error: EnvHubError, snapshot: Snapshot) -> str:
-    """Advice if local code lacks a file or module that exists in its folder.
+    """Advice if the code of a local folder lacks a file that the folder has but does not show.
 
-    Trust: the names come from the worker's text, which so chooses among our sentences.
+    Trust: the names come from the worker's text, which only selects one of our sentences.
     """
     remote = error if isinstance(error, (RemoteEnvError, DependencyError)) else error.__cause__
     if not isinstance(remote, (RemoteEnvError, DependencyError)) or not snapshot.is_local:
@@ -250,11 +250,11 @@ def why_missing(error: EnvHubError, snapshot: Snapshot) -> str:
 
 
 def _names(text: str, folder: str) -> Iterator[str]:
-    """Paths below a folder that a text may mean, the likeliest first."""
+    """Paths below a folder that a text may refer to, the likeliest first."""
     modules = [match[1].split(".")[0] for match in re.finditer(_NO_MODULE, text)]
     for module in modules[:_MOST_NAMES]:
         yield from (f"{module}.py", module)
-        # in a folder that code puts on its path
+        # the code may put a folder of the repository on sys.path
         for path in sorted(Path(folder).glob(f"*/{module}*")):
             if path.name in (module, f"{module}.py"):
                 yield path.relative_to(folder).as_posix()
@@ -262,7 +262,7 @@ def _names(text: str, folder: str) -> Iterator[str]:
         steps = (match[1] or match[2] or match[3]).rstrip(".,:;)").replace("\\", "/").split("/")
         steps = [step for step in steps if step not in ("", ".")]
         if steps and ".." not in steps and "\0" not in match[0]:
-            # of an absolute path, or of one on another host, only the end is known
+            # for an absolute path, or one on another host, try each of its ends
             yield from ("/".join(steps[first:]) for first in range(min(len(steps), _DEEPEST)))
 
 
@@ -271,11 +271,11 @@ def _names(text: str, folder: str) -> Iterator[str]:
 _DENIAL = r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40}| /.{0,400})?"
 _MOST_DENIALS = 128
 _NAMED_DENIALS, _SHOWN = 8, 200
-"""Denials in the text of an error, and characters of each."""
+"""The most denials in an error's text, and the most characters of each."""
 
 
 def read_denials(reported: object) -> tuple[str, ...] | None:
-    """What a jail was denied, by its server's records; None if that is not recorded.
+    """The denials of a jail that its server has recorded; None if it does not record them.
 
     Trust: a server on another host may say anything, and a stranger chose the paths.
     """
@@ -286,7 +286,7 @@ def read_denials(reported: object) -> tuple[str, ...] | None:
 
 
 def name_denied(error: WorkerDiedError) -> None:
-    """Say in the error what a process was denied before it ended: that is often the reason."""
+    """Add to the error what was denied to a process before it ended: often the reason."""
     text = ""
     if error.denied:
         more = len(error.denied) - _NAMED_DENIALS
@@ -295,5 +295,5 @@ def name_denied(error: WorkerDiedError) -> None:
     elif error.denied is None and error.signal not in (None, "SIGKILL"):
         recording = option_name("policy", {"record_denials": True})
         text = f"If something that it was denied is the reason, {recording} names it"
-    if text and text not in str(error):  # called again where nothing is recorded
+    if text and text not in str(error):  # may be called again if nothing is recorded
         error.args = (f"{error.args[0]}\n{text}", *error.args[1:])

@@ -1,4 +1,4 @@
-"""Failures of requests: the error for the caller, the crash bundle, the lifecycle's move.
+"""Failures of requests: makes the caller's error, writes a crash bundle, and moves the state.
 
 ``refusal`` is the error of a request that the state does not permit; ``Restarts`` bounds how often
 and how soon a dead worker is replaced.
@@ -25,7 +25,7 @@ _LOOK_AGAIN_S = 0.1
 
 
 def expiry(operation: str, why: str) -> WorkerDiedError:
-    """The error of an environment that was idle for too long."""
+    """The error of a request to an environment whose jail ended because it was idle."""
     text = f"cannot {operation}: {why}, so its processes were ended; call reset() first"
     return WorkerDiedError(text, reason="idle", request=operation, detail=why)
 
@@ -69,7 +69,7 @@ def _advice(restart: str) -> str:
 
 
 class Restarts:
-    """The restarts of one environment, which its counters count."""
+    """Permits and delays the restarts of one environment; its counters count them."""
 
     def __init__(self, policy: Policy, counters: Counters) -> None:
         self._policy = policy
@@ -80,17 +80,17 @@ class Restarts:
 
     @property
     def permitted(self) -> bool:
-        """Whether the policy permits any."""
+        """Whether the policy permits restarts."""
         return self._policy.restart != "never"
 
     def give_up(self) -> None:
-        """End a wait for a restart in another thread soon."""
-        # interruption.md, rule 12: no Event
+        """Soon end the wait for a restart in another thread."""
+        # interruption.md, rule 12: an Event has a lock, which this very thread may hold
         self._given_up = True
 
     def spend(self, operation: str) -> None:
-        """Count a restart, after a pause if the last one was a moment ago.
-        Raises ``WorkerDiedError``: there are none left, or the environment was closed.
+        """Count a restart, after a pause if the last restart was less than a minute ago.
+        Raises ``WorkerDiedError``: no restarts are left, or the environment was closed.
         """
         budget = self._policy.restart_budget
         if self._counters.restarts >= budget:
@@ -114,15 +114,15 @@ class Restarts:
 
 
 def backoff_s(first_s: float, in_a_row: int) -> float:
-    """Seconds to wait before a restart, after ``in_a_row`` others shortly before it."""
+    """The seconds to wait before a restart that follows ``in_a_row`` others in short succession."""
     if in_a_row == 0:
         return 0.0
     return min(first_s * 2.0 ** min(in_a_row - 1, 64), _LONGEST_S)
 
 
 class Failures:
-    """The failures of one environment's requests.
-    ``interruption``: the request whose wait was interrupted, if that is why its reply is late.
+    """Handles the failures of one environment's requests.
+    ``interruption``: the request whose reply is late because its wait was interrupted, or None.
     """
 
     def __init__(self, lease: Lease, recorder: Recorder) -> None:
@@ -133,17 +133,17 @@ class Failures:
         self.interruption: str | None = None
 
     def timed_out(self, operation: str, deadline: Deadline) -> WorkerTimeoutError:
-        """A request's deadline passed: the environment is LATE from now on."""
+        """Move to LATE, since a request's deadline has passed; returns the error."""
         self._counters.timeouts += 1
         self.interruption = None
         self._lease.lifecycle.moved(Event.TIMEOUT)
         return self.late(operation, deadline)
 
     def interrupted(self, error: BaseException) -> None:
-        """Ctrl-C, or another exception of a signal handler, ended a wait.
+        """Move to LATE, since an exception of a signal handler, such as a Ctrl-C, ended a wait.
 
-        The reply may still come, so the environment is LATE, and not READY.
-        Raises ``WorkerDiedError``: a ``close`` within the wait took away what was waited for.
+        It is not READY, because the reply may still come.
+        Raises ``WorkerDiedError``: a ``close`` during the wait has ended the jail.
         """
         if self._lease.lifecycle.closed and isinstance(error, Exception):
             raise self.dead(WorkerDiedError("")) from error
@@ -169,16 +169,16 @@ class Failures:
         return error
 
     def expired(self, operation: str, why: str) -> WorkerDiedError:
-        """The server has ended the jail because it was idle."""
+        """Move to EXPIRED, since the server has ended an idle jail; returns the error."""
         lifecycle = self._lease.lifecycle
         lifecycle.moved(Event.EXPIRY)
         lifecycle.request = None
         return expiry(operation, why)
 
     def dead(self, error: EnvHubError) -> EnvHubError:
-        """The jail died, or broke a rule of the protocol: the environment is DEAD from now on.
+        """Move to DEAD, since the jail has died or violated the protocol.
 
-        A jail that still lives is ended. Returns the error for the caller, which after a ``close``
+        A jail that still lives is ended. Returns the error for the caller; after a ``close`` it
         says that the environment was closed.
         """
         lifecycle, lease = self._lease.lifecycle, self._lease
@@ -195,7 +195,7 @@ class Failures:
             if lease.loaded is not None and (lease.loaded.jail.kept or not died):
                 lease.end()
         if isinstance(error, WorkerDiedError):
-            self._write_crash(error)  # denials are asked for once: a silent server costs 10 s
+            self._write_crash(error)  # not keep_crash: asking a silent server again would cost 10 s
         return error
 
     def keep_crash(self, error: WorkerDiedError | WorkerTimeoutError) -> None:

@@ -1,4 +1,4 @@
-"""Opens jails for one repository, in the place where its workers run."""
+"""Opens and ends jails for one repository, on the server where its workers run."""
 
 from __future__ import annotations
 
@@ -38,29 +38,29 @@ if TYPE_CHECKING:
     from envhub_sandbox.transport.jail import JailHandle
 
 _PLAY_SHARE, _MOST_PLAY_MS = 0.5, 3_600_000
-"""The share of the start's time, and the most milliseconds, in which sub-environments may be played
-to see whether they are independent."""
+"""The share of the start's time, and the most milliseconds, for playing sub-environments to see
+whether they are independent."""
 _CLOSE_S = 5.0
 _LOST_S = 1.0
-"""To end a jail over a lost connection: a living server ends by itself a jail without a client."""
+"""How long to try to end a jail after its connection was lost; a living server ends it anyway."""
 _SHARE = 0.5
-"""The share of the remaining time that one server of a fleet may take to open a jail."""
+"""The share of the remaining time that one server of several may take to open a jail."""
 _SILENT_S = 30.0
-"""For how long a silent server is not asked again to end a jail."""
+"""How long a silent server is not asked again to end a jail."""
 _STATUS_S = 1.0
 _DENIED_S = 10.0
-"""A caller who has denials recorded wants to know them, also of a host that is busy."""
+"""Longer than ``_STATUS_S``: a caller who records denials wants them also from a busy host."""
 _UNKNOWN = ("server", "connection", "gone")
-"""Reasons of a death about which its server can say nothing."""
+"""Reasons of a death for which no server can tell the denials."""
 
 
 @dataclass(frozen=True)
 class ExpectedManifest:
-    """What a repository's ``make_env`` has returned before.
+    """The manifest that a repository's ``make_env`` has returned before.
 
     Attributes:
-        task: The environment that a jail is wanted for.
-        shards: Over how many runners it is going to be spread.
+        task: The environment for which the jail is opened.
+        shards: The number of runners over which the environment will be spread.
     """
 
     manifest: Manifest
@@ -71,20 +71,21 @@ class ExpectedManifest:
 class LoadedJail:
     """An open jail whose first runner has called ``make_env``.
 
-    Its owner must give it back; after a Ctrl-C before the owner noted it, its finalizer does.
+    Its owner must give it back. If a Ctrl-C comes before the owner has noted the jail, the
+    finalizer gives it back.
 
     Attributes:
-        manifest: What ``make_env`` returned, checked.
-        loaded: Runners that have called it.
-        use: The use of its server.
-        address: The server's place in errors.
+        manifest: The checked manifest of what ``make_env`` returned.
+        loaded: The runners that have called ``make_env``.
+        use: The use of the jail's server.
+        address: The server's address for errors.
         give_back: ``Launcher.close`` or ``Launcher.disconnect``.
-        ending: Whether ending it has begun.
+        ending: Whether ending the jail has begun.
         closing: Whether a call of ``Launcher.close`` is running.
         ended: Whether its end was requested, so that only the use of the server is left.
-        closed: Whether all was given back.
-        lost: Whether the connection to its server was lost.
-        changed: Whether a runner returned something else than the manifest says.
+        closed: Whether jail and server were given back.
+        lost: Whether the connection to the server was lost.
+        changed: Whether a runner returned another environment than the manifest says.
     """
 
     def __init__(
@@ -109,28 +110,28 @@ class LoadedJail:
 
     @property
     def server(self) -> WorkerServer:
-        """The server that runs it."""
+        """The server that runs the jail."""
         return self.use.server
 
     def __del__(self) -> None:
-        # interruption.md, rule 5. At the end of the process no server is in use any more: nothing
-        # is closed one by one there (rule 13).
-        if "owner" not in vars(self):  # the last field: an interrupt came before there was a jail
+        # interruption.md, rule 5. At the end of the process the servers end by themselves, so no
+        # jail is closed then (rule 13).
+        if "owner" not in vars(self):  # the last field: an interrupt came into __init__
             return
         if not self.closed and self.use.live and self.owner.is_here:
-            self.ending = True  # its connection may have gone before it
+            self.ending = True  # its connection may be gone already: end the jail over a new one
             self.give_back(self)
 
 
 class Launcher:
     """Opens and ends the jails of one repository. Thread-safe.
-    ``store``: the folder that snapshots lie in.
+    ``store``: the folder of the snapshots.
 
     Attributes:
-        runs_on: What runs it where it runs; a remembered manifest holds for this only.
-        retry_s: For how long to ask again, where a server has no room.
-        plays: Whether a jail that describes sub-environments plays them, to see whether they are
-            independent: not where that is known.
+        runs_on: The interpreter and machine of the workers; a remembered manifest holds only there.
+        retry_s: How long to ask again while a server has no room.
+        plays: Whether a jail that describes sub-environments also plays them, to see whether they
+            are independent; False if that is known.
         server_hold: Keeps the server while an environment may need it again.
     """
 
@@ -152,15 +153,15 @@ class Launcher:
         self.server_hold = ServerHold(self._acquire, hold, let_go)
 
     def another(self) -> Launcher:
-        """A launcher for another worker in the same place."""
+        """A launcher for another worker of the same sandbox."""
         return Launcher(self.repository, self._sandbox, self._store)
 
     def where(self, loaded: LoadedJail | None) -> str:
-        """The place of a jail in errors; of the next one for None."""
+        """The address of a jail for errors; for None, the address of the next jail."""
         return self._sandbox.address if loaded is None else loaded.address
 
     def hold(self) -> Callable[[], None]:
-        """Keep the server between two jails; returns what gives it back."""
+        """Keep the server between two jails; returns the function that releases it."""
         return self._acquire().release
 
     def _acquire(self, sandbox: Sandbox | None = None) -> ServerUse[WorkerServer]:
@@ -169,10 +170,10 @@ class Launcher:
 
     def open(self, deadline: Deadline, expected: ExpectedManifest | None = None) -> LoadedJail:
         """Fork a jail and have its first runner call ``make_env``.
-        ``expected``: its known result. A suite then need not build each task to describe it; what
-        is built is compared with it later.
+        ``expected``: the known result of ``make_env``. A suite then need not build each task to
+        describe it; the built environment is compared with this manifest later.
         Raises ``LoadError``: the repository failed to load, or returned something unusable;
-        ``WorkerError``: the jail did not come up, died, or took too long.
+        ``WorkerError``: the jail did not start, died, or took too long.
         """
         failures: list[EnvHubError] = []
         for sandbox in self._sandbox.candidates():
@@ -191,10 +192,10 @@ class Launcher:
         began = monotonic()
         use = self._acquire(sandbox)
         if use.server.far is not None:
-            deadline.postpone(monotonic() - began)  # a cluster may have started a machine for it
+            deadline.postpone(monotonic() - began)  # a cluster may have started a machine
         loaded: LoadedJail | None = None
         try:  # interruption.md, rule 4
-            # one on another host runs anyway
+            # a server on another host keeps running anyway
             if self.repository.timeouts.server_idle_s != 0 and use.server.is_ours:
                 self.server_hold.keep(use.server)
             with self.repository.starting(deadline):
@@ -204,7 +205,7 @@ class Launcher:
         except BaseException:
             if loaded is None:
                 use.release()
-            else:  # its finalizer does nothing once the use is released
+            else:  # not by the finalizer, which does nothing once the use is released
                 self.close(loaded)
             raise
 
@@ -220,7 +221,8 @@ class Launcher:
         client = self._client(server)
         try:
             client.hello(deadline)
-            # all at once, where they will load what is known: else it is asked for, and then again
+            # If the manifest is known, all runners start at once. Otherwise one runner starts, and
+            # ``spread`` starts the others when the manifest says how many there are.
             order = self._order(expected.shards if expected else 1)
             order = sandbox.prepare(order, server, client, deadline)
             in_turn = server.far is not None and sandbox is not self._sandbox
@@ -258,8 +260,8 @@ class Launcher:
         deadline: Deadline,
         sandbox: Sandbox | None,
     ) -> JailHandle:
-        """Open a jail; ``sandbox`` is one of several, and must leave time to try the next.
-        Raises ``WorkerStartupError``: it took too long there.
+        """Open a jail. If ``sandbox`` is given, there are others, which need time, too.
+        Raises ``WorkerStartupError``: this server took too long.
         """
         from envhub_sandbox.transport.jail import open_jail  # sandboxes/process.py says why here
 
@@ -318,7 +320,7 @@ class Launcher:
         return LoadedJail(jail, manifest, reply.manifest, {runner}, use, self.close)
 
     def _wanted_output(self) -> OutputSinks:
-        """Where the output of the next jail goes; each jail has its own file."""
+        """The destinations for the output of the next jail; each jail has its own file."""
         output = self.repository.policy.output
         if output in ("stderr", "-"):
             return OutputSinks(self.repository.label, None, stderr=True)
@@ -344,7 +346,7 @@ class Launcher:
     def load(
         self, loaded: LoadedJail, runners: list[int], deadline: Deadline, task: EnvManifest
     ) -> None:
-        """Have runners of a jail call ``make_env`` for a known task."""
+        """Have runners of a jail call ``make_env`` for a known task; notes a changed result."""
         jail = loaded.jail
         load = self.repository.arguments
         arguments = load.n_envs, load.use_async_envs, load.cfg, load.env_kwargs
@@ -367,17 +369,17 @@ class Launcher:
         return LoadedJail(jail, *shown, use, self.disconnect, loaded.address)
 
     def disconnect(self, loaded: LoadedJail) -> None:
-        """Drop a further connection. Idempotent."""
+        """Close a connection that ``connect`` has opened. Idempotent."""
         loaded.jail.client.close()
         loaded.use.release()
         loaded.closed = True
 
     def close(self, loaded: LoadedJail, *, wait: bool = True) -> None:
         """End a jail and give its server back. Idempotent; an interrupted call can be repeated.
-        ``wait``: until nothing of it is left; otherwise the next close of an environment of the
-        repository waits for that.
+        ``wait``: whether to wait until all processes have ended; otherwise the next close of an
+        environment of the repository waits for that.
         """
-        if loaded.closed or loaded.closing:  # a signal handler may come into it, or a thread
+        if loaded.closed or loaded.closing:  # closed by a signal handler or a thread
             return
         try:
             loaded.closing = True
@@ -398,7 +400,7 @@ class Launcher:
             wait_for_end = partial(loaded.jail.ask_to_close(), Deadline(_CLOSE_S))
             if wait or not self.server_hold.close_later(loaded.server, wait_for_end):
                 wait_for_end()
-        else:  # interruption.md, rule 7: what was sent is not known: over another connection
+        else:  # interruption.md, rule 7: the state of this connection is unknown, so use another
             self.interrupt(loaded)
             loaded.jail.drop()
         loaded.ended = True
@@ -406,9 +408,9 @@ class Launcher:
     def status(
         self, server: WorkerServer, jail: int, timeout_s: float = _STATUS_S
     ) -> dict[str, Any]:
-        """What its server says of a jail; empty if it does not answer.
+        """What the server says about a jail; empty if it does not answer.
 
-        Asked over a new connection: on the jail's own, a late reply would be dropped.
+        The question goes over a new connection: on the jail's own, a late reply would be dropped.
         Trust: a server on another host may say anything.
         """
         try:
@@ -417,7 +419,7 @@ class Launcher:
                 for facts in expect_reply(status, m.Status).jails:
                     if isinstance(facts, dict) and facts.get("jail") == jail:
                         return facts
-        except EnvHubError:  # it is for a text, or a figure that may be missing
+        except EnvHubError:  # callers can do without: they only show it
             pass
         return {}
 
@@ -432,13 +434,13 @@ class Launcher:
             return None
 
     def denials(self, server: WorkerServer, jail: int) -> tuple[str, ...] | None:
-        """What a jail was denied; None if that is not recorded, or not known any more."""
+        """The denials of a jail; None if they are not recorded, or not known any more."""
         if not self.repository.policy.record_denials:
             return None
         return read_denials(self.status(server, jail, _DENIED_S).get("denied"))
 
     def note_denied(self, error: BaseException, server: WorkerServer, jail: int) -> None:
-        """Put what a jail was denied into the error that ended it, before it is closed."""
+        """Add a jail's denials to the error that ended it, before the jail is closed."""
         if not isinstance(error, EnvHubError) or error.denied is not None:
             return
         if getattr(error, "reason", "") not in _UNKNOWN:
@@ -447,7 +449,7 @@ class Launcher:
                 name_denied(error)
 
     def interrupt(self, loaded: LoadedJail) -> None:
-        """End a jail over a new connection: another thread may wait on its own."""
+        """End a jail over a new connection, since another thread may wait on the jail's own."""
         loaded.jail.before_end()
         server = loaded.server
         if loaded.lost and monotonic() - server.silent_s < _SILENT_S:
@@ -455,7 +457,7 @@ class Launcher:
         deadline = Deadline(_LOST_S if loaded.lost else _CLOSE_S)
         try:
             self._ask(server, m.CloseJail(loaded.jail.number), deadline)
-        except EnvHubError:  # the server has gone, and the jail with it
+        except EnvHubError:  # the server has ended, and the jail with it, or it is silent
             server.silent_s = monotonic()
 
     def _ask(self, server: WorkerServer, message: m.Message, deadline: Deadline) -> m.Message:

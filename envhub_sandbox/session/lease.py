@@ -1,7 +1,7 @@
-"""An environment's hold on a jail: taken, built in, given up for another, and given back.
+"""A lease: takes a jail for an environment, builds in it, replaces it, and gives it back.
 
-It does not know the requests to the environment, nor why a jail is given up. ``AttributeCache``
-answers reads of attributes after each step, which the runners watch from the second read on.
+The lease does not know the requests to the environment, nor why a jail is given up.
+``AttributeCache`` answers reads of attributes that the runners watch, without a request.
 """
 
 from __future__ import annotations
@@ -42,31 +42,31 @@ if TYPE_CHECKING:
     from envhub_sandbox.transport.lane import Lane
 
 _WITHOUT_A_JAIL = frozenset({State.EXPIRED, State.DEAD, State.FOREIGN, State.CLOSED})
-"""It may not have been given back yet."""
+"""The states of an environment whose jail is not usable, though perhaps not given back yet."""
 _COLD_STEPS = 8
-"""Steps that are not measured: much happens only once in them."""
+"""The number of first steps that are not measured, as they include one-time work."""
 _LONGEST = 30
-"""A longer step, in medians, counts as this long: it was paused, not waiting for a core."""
+"""The longest time, in medians, that a step counts: a longer one was paused for another reason."""
 _SUCCESSOR_S = 60.0
-"""For how long a restart waits for the server that comes in the place of one that ends."""
+"""How long a restart waits for the server that replaces one that is ending."""
 _MOST_READ = 64
-"""Names of one environment that are remembered."""
+"""The most attributes of one environment whose reads are counted."""
 _MOST_STATES, _STATE_CHARS = 64, 40
-"""Words about runners that are shown, and characters of each."""
+"""The most words about runners to show, and the most characters of each."""
 _NEVER = 1 << 62
 
 
 class Lease:
     """The jail of one environment, if it has one, and the lane to its runners.
 
-    Used by the thread that holds the environment's lock; but a closing thread calls ``interrupt``,
-    and a fork ``abandon``.
+    Only the thread that holds the environment's lock uses it; but a closing thread may call
+    ``interrupt``, and a fork calls ``abandon``.
 
     Attributes:
-        results: What the environment is expected to be, and its slices.
-        loaded: The jail; None while there is none.
-        lane: The way to its runners there.
-        make_room: Asked to end what was started ahead, where a server has no place left.
+        results: The expected manifest of the environment, and its slices.
+        loaded: The jail, or None.
+        lane: The lane to the jail's runners, or None.
+        make_room: Ends jails that were started ahead, when a server has no room.
         depart: Says that this environment does not need the server again. Idempotent.
     """
 
@@ -89,7 +89,7 @@ class Lease:
         self.counters = counters
         self._trials = trials
         self._builder = Builder(jails, results)
-        # interruption.md, rule 12: none gives back what another ends
+        # interruption.md, rule 12: no thread gives a jail back while another ends it
         self._ending = threading.RLock()
         self._owner = OwnerProcess()
         self._was_loaded = False
@@ -105,40 +105,40 @@ class Lease:
 
     @property
     def place(self) -> str:
-        """What errors call the place where its jail is, or the next one will be."""
+        """The address of the jail, or of the next jail, for errors."""
         return self._launcher.where(self.loaded)
 
     def report(self) -> list[dict[str, Any]]:
-        """The layers of the jail; none where there is none."""
+        """The layers of confinement of the jail; empty without a jail."""
         loaded = self.loaded  # another thread may give it back
         if loaded is None or self.lifecycle.state in _WITHOUT_A_JAIL:
             return []
         return loaded.jail.report
 
     def states(self) -> tuple[str, ...]:
-        """What its runners are doing, one word each. Trust: text from the worker."""
+        """One word for each runner about what it is doing. Trust: text from the worker."""
         states = self.status().get("states")
         words = states[:_MOST_STATES] if isinstance(states, tuple) else ()
         return tuple(one_line(word, _STATE_CHARS) for word in words if isinstance(word, str))
 
     def status(self) -> dict[str, Any]:
-        """What its server says of its jail: see ``Launcher.status``."""
+        """What the server says about the jail, as by ``Launcher.status``; empty without a jail."""
         at = self._at()
         return {} if at is None else self._launcher.status(*at)
 
     def denials(self) -> tuple[str, ...] | None:
-        """What its jail was denied, also where that is dead; None where it is not recorded."""
+        """The denials of the jail, also of a dead one; None if they are not recorded."""
         at = self._at()
         return None if at is None else self._launcher.denials(*at)
 
     def note_denied(self, error: EnvHubError) -> None:
-        """Put its denials into the error that ended the jail, before the jail is given back."""
+        """Add the jail's denials to the error that ended it, before the jail is given back."""
         at = self._at()
         if at is not None:
             self._launcher.note_denied(error, *at)
 
     def _at(self) -> tuple[WorkerServer, int] | None:
-        """The server, and the number of its jail there."""
+        """The jail's server and its number there; None without a jail."""
         loaded = self.loaded  # another thread may give it back
         return None if loaded is None else (loaded.server, loaded.jail.number)
 
@@ -154,13 +154,13 @@ class Lease:
             loaded.lost = True
 
     def watched(self, name: str) -> AttributeAnswer | None:
-        """What is known of a watched attribute, while the environment can be asked."""
+        """The known values of a watched attribute; None if unknown or if the state is not READY."""
         if self.lane is None or self.lifecycle.state is not State.READY:
             return None
         return self.lane.jail.watched.values(self.lane.number, name)
 
     def note_watched(self, name: str, values: AttributeAnswer) -> bool:
-        """Keep the values of an attribute that the runners watch; whether they can be kept."""
+        """Keep the values of a watched attribute; returns whether they can be kept."""
         lane = self.lane
         return lane is not None and lane.jail.watched.note(lane.number, name, values)
 
@@ -173,27 +173,27 @@ class Lease:
     # --- taking a jail ---------------------------------------------------------------------------
 
     def acquire(self, deadline: StartupDeadline) -> None:
-        """Take a jail, and build the environment in it; ``interrupt`` brings the deadline forward.
-        Raises ``LoadError``: the repository failed to load, or returned something else than before;
-        ``WorkerError``: the jail did not come up, died, took too long, or was given up.
+        """Take a jail, and build the environment in it; ``interrupt`` ends the deadline early.
+        Raises ``LoadError``: the repository failed to load, or returned another environment than
+        before; ``WorkerError``: the jail did not start, died, took too long, or was given up.
         """
-        self.give_back()  # of an attempt that was interrupted when all was built
+        self.give_back()  # a jail of an earlier attempt that was interrupted after it was noted
         with self._starting(deadline):
             self._move_in(self._take(deadline), deadline)
 
     def adopt(self, loaded: LoadedJail, deadline: Deadline) -> None:
-        """Use a jail that is already loaded, instead of taking one."""
+        """Build in a jail that is loaded already, instead of taking one."""
         with self.repository.starting(deadline):
             self._move_in(loaded, deadline)
 
     def replace(self, deadline: StartupDeadline) -> None:
-        """Give the jail up, and take another in the same server; raises as ``acquire`` does."""
+        """Replace the jail by a new one in the same server; raises as ``acquire`` does."""
         with self._starting(deadline):
             self.leave()
             self._move_in(self._take(deadline), deadline)
 
     def rebuild(self, dead: list[int], deadline: StartupDeadline) -> None:
-        """Build some shards again, in fresh runners of this jail; raises as ``acquire`` does."""
+        """Build dead shards again, in new runners of this jail; raises as ``acquire`` does."""
         loaded, lane = self.loaded, self.lane
         assert loaded is not None
         assert lane is not None
@@ -201,7 +201,7 @@ class Lease:
             self._builder.rebuild(loaded, lane, dead, deadline)
 
     def take_apart(self, deadline: Deadline) -> None:
-        """See ``Results.apart``: from now on, in the jail that there is and in each later one."""
+        """Have infos come apart (``Results.apart``), in the present jail and in each later one."""
         self.results.apart = True
         if self.lane is not None:
             self._builder.take_apart(self.lane, range(len(self.results.bounds)), deadline)
@@ -224,7 +224,7 @@ class Lease:
             retry_s = self._patience_s(error)
             if deadline.unasked or not (full or retry_s):
                 raise
-            # both, whatever the first one finds: | and not "or"
+            # | and not "or": both have to run
             room = full and self._launcher.server_hold.settle() | self.make_room()
             if not room and not retry_s:
                 raise
@@ -233,7 +233,7 @@ class Lease:
         return retry_while_busy(ask, retry_s, deadline, self.repository.label, refused)
 
     def _patience_s(self, error: EnvHubError) -> float:
-        """How long to retry. With restarts, a server that ended is replaced within a minute."""
+        """How long to retry. With restarts, wait a minute for a server that replaces another."""
         retry_s = self._launcher.retry_s if _is_full(error) else 0.0
         if self.repository.policy.restart == "never":
             return retry_s
@@ -241,7 +241,10 @@ class Lease:
         return max(retry_s, _SUCCESSOR_S) if lost or is_draining(error) else retry_s
 
     def _move_in(self, loaded: LoadedJail, deadline: Deadline) -> None:
-        """Build the environment in a jail; a Ctrl-C leaves none behind: interruption.md, rule 4."""
+        """Build the environment in a jail, and note the jail; on failure, give it back."""
+        # interruption.md, rule 4: ``try`` is the first statement, and jail and lane are noted side
+        # by side, so a Ctrl-C finds the jail either noted here or given back below. CLOSED is
+        # checked only after that: a ``close`` from then on sees the jail and ends it.
         try:
             lane = self._builder.build(loaded, deadline)
             self.loaded, self.lane = loaded, lane
@@ -253,18 +256,18 @@ class Lease:
             raise
         self._was_loaded = True
         self.counters.connected(lane)
-        if self.lifecycle.closed:  # only now: a close from here on sees the jail
+        if self.lifecycle.closed:
             raise closed_during("make_env")
 
     # --- giving it back --------------------------------------------------------------------------
 
     def end(self) -> None:
-        """End the jail, whatever it is doing. It is still to be given back."""
+        """End the jail, whatever it is doing. The caller still has to give it back."""
         if self.loaded is not None:
             self._jails.end(self.loaded)
 
     def leave(self) -> None:
-        """End the jail and give it back, but keep its server for another."""
+        """End the jail and give it back, but keep its server for the next jail."""
         self._let_server_go()
         self._release_server = self._launcher.hold()
         try:
@@ -273,13 +276,13 @@ class Lease:
             self.give_back()
 
     def give_back(self, *, wait: bool = True) -> None:
-        """Give the jail back, if there is one; see ``Launcher.close``."""
+        """Give the jail back, if there is one; ``wait`` as for ``Launcher.close``."""
         with self._ending:
             loaded = self.loaded
             try:
                 if loaded is not None:
                     self._jails.give_back(loaded, wait=wait)
-                self.loaded = None  # interruption.md, rule 7: only now
+                self.loaded = None  # interruption.md, rule 7: only after it was given back
             except Exception:
                 self.loaded = None
                 raise
@@ -287,7 +290,7 @@ class Lease:
                 self._close_lane()
 
     def close_politely(self) -> None:
-        """Let the repository's ``close`` run; whatever it does, the processes end after it."""
+        """Have the repository's own ``close`` run, within ``close_s``, and ignore its errors."""
         lane, deadline = self.lane, Deadline(self.repository.timeouts.close_s)
         if lane is None:
             return
@@ -296,18 +299,18 @@ class Lease:
             lane.jail.ask("close", [(runner, packed) for runner in lane.runners], deadline)
 
     def note_steps(self) -> None:
-        """Remember how long steps took, for the next use of the same commit."""
+        """Remember the mean time of a step, for the next use of the same commit."""
         latencies_s = self.counters.latencies_s()
         if len(latencies_s) >= LEAST_STEPS:
             latencies_s = latencies_s[_COLD_STEPS:]
-            # the mean, for on a busy machine it is a few steps that wait for a core, and long; but
-            # a pause counts no more than they do
+            # The mean, because on a busy machine a few steps wait long for a core. A pause counts
+            # no more than such a step.
             longest_s = _LONGEST * np.median(latencies_s)
             step_s = float(np.minimum(latencies_s, longest_s).mean())
             self._trials.note(self.results.manifest, self.results.bounds, step_s)
 
     def let_go(self, *, wait: bool = True) -> None:
-        """Give back everything for good. In a fork of the owner, do nothing."""
+        """Give back jail and server for good. A fork of the owner does nothing."""
         if not self._owner.is_here:
             return
         try:
@@ -317,9 +320,9 @@ class Lease:
             self.depart()
 
     def interrupt(self, close: Callable[[], None]) -> bool:
-        """From another thread, ``close`` the environment and end the jail that a request waits for;
-        False if there is none yet: whoever takes one sees that it is closed. See interruption.md,
-        rule 11.
+        """From another thread, ``close`` the environment and end the jail that a request waits for:
+        interruption.md, rule 11. Returns False if there is no jail yet; the thread that takes it
+        sees then that the environment is closed.
         """
         with self._ending:
             close()
@@ -339,7 +342,7 @@ class Lease:
         if lane is not None:
             self.counters.connected(None)
             lane.close()
-            self.lane = None  # as above
+            self.lane = None  # interruption.md, rule 7, as above
 
     def _let_server_go(self) -> None:
         self._release_server()
@@ -347,7 +350,7 @@ class Lease:
 
 
 def _is_full(error: EnvHubError) -> bool:
-    """Whether the server has no room. Older servers send a plain ``WorkerError`` for that."""
+    """Whether the server has no room. Older servers say that by a plain ``WorkerError``."""
     return isinstance(error, ServerBusyError) or type(error) is WorkerError
 
 
@@ -358,20 +361,20 @@ def closed_during(operation: str) -> WorkerDiedError:
 
 
 def _nothing() -> None:
-    """Release nothing."""
+    """Release nothing: no server is kept."""
 
 
-# --- attributes that are watched
+# --- watched attributes
 
 
 class _Reads:
-    """The reads of one attribute.
+    """Counts the reads of one attribute, to decide whether to watch it.
 
     Attributes:
-        steps: How many steps each worker had answered at the last one.
-        rounds: How many came after a step, since it was last watched.
-        patience: How many are needed until it is watched.
-        watched: Whether it was, at the last answer.
+        steps: The number of steps that each worker had answered at the last read.
+        rounds: The number of reads that each followed a step, since the attribute was last watched.
+        patience: The number of such reads before the attribute is watched.
+        watched: Whether the runners watched it at the last answer.
     """
 
     __slots__ = ("patience", "rounds", "steps", "watched")
@@ -381,15 +384,15 @@ class _Reads:
 
 
 class AttributeCache:
-    """The attributes of one environment that need no request. Not thread-safe.
+    """Answers reads of attributes that need no request. Not thread-safe.
 
-    LeRobot's evaluation reads the task of every sub-environment after each step. Each read was a
-    request, which costs as much as the step, and on another host a round trip. A watched attribute
-    (``envhub_worker.runner.prefixes``) is answered from here, once a step: a caller that reads it
-    twice waits for something to happen, and the environment answers.
+    LeRobot's evaluation reads the task of every sub-environment after each step. A request for it
+    costs as much as the step, and on another host a round trip. If the runners watch an attribute
+    (``envhub_worker.runner.prefixes``), the cache answers its first read after each step. A second
+    read goes to the environment, because such a caller may wait for the value to change.
 
     ``leases``: one for each worker of the environment.
-    ``rows``: the slice of the sub-environments that each worker has.
+    ``rows``: each worker's slice of the sub-environments.
     """
 
     def __init__(self, leases: Sequence[Lease], rows: Sequence[tuple[int, int]]) -> None:
@@ -398,7 +401,7 @@ class AttributeCache:
         self._reads: dict[str, _Reads] = {}
 
     def get(self, name: str) -> AttributeAnswer | None:
-        """The values, if a step was answered since the last read; None: a request is needed."""
+        """The values, if a step was answered since the last read; None if a request is needed."""
         reads = self._reads.get(name)
         if reads is None:
             return None
@@ -416,7 +419,7 @@ class AttributeCache:
         return error or tuple(gathered)
 
     def should_watch(self, name: str) -> bool:
-        """A request for it follows: whether that request is to have it watched."""
+        """Count a read that needs a request; returns whether to have the attribute watched."""
         if any(lease.lane is None for lease in self._leases):
             return False
         steps = self._steps()
@@ -426,14 +429,14 @@ class AttributeCache:
                 self._reads[name] = _Reads(steps)
             return False
         if reads.watched and any(lease.watched(name) is None for lease in self._leases):
-            # it has changed: with each time that it does, it takes twice as long to be watched
+            # it has changed: each change doubles the reads that it takes to watch it again
             reads.watched, reads.rounds, reads.patience = False, 0, 2 * reads.patience
         reads.rounds += reads.steps != steps
         reads.steps = steps
         return reads.rounds >= reads.patience
 
     def put(self, name: str, values: AttributeAnswer, *, watched: bool) -> None:
-        """Keep the answer to a request after ``should_watch``; ``watched`` is the runners' word."""
+        """Keep an answer after ``should_watch``; ``watched``: whether the runners say they do."""
         reads = self._reads[name]
         reads.watched = watched
         for lease, (start, stop) in zip(self._leases, self._rows, strict=True):

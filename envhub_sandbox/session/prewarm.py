@@ -1,8 +1,8 @@
-"""The start of an environment's processes: for its first request, or ahead of that.
+"""Starts an environment's processes, at its first request or ahead of it (prewarming).
 
-An evaluation plays task after task, and each takes time before its first ``reset`` returns: for
-processes, imports and simulators. The next task can start in the background meanwhile. Results do
-not depend on that: a start ahead that fails is repeated by the first request.
+An evaluation plays task after task, and each task needs time for processes, imports and simulators
+before its first ``reset`` returns. The next task can start in the background while one is played.
+Results do not depend on that: if a start ahead fails, the first request repeats it.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ if TYPE_CHECKING:
     from envhub_sandbox.session.recovery import Recovery
 
 LOOK_S = 10.0
-"""How long a look at a jail that may have died may take."""
+"""How long to wait for the server to say whether a jail still lives."""
 INTERRUPT_S = 10.0
-"""How long ``close`` waits at most for another thread to notice that the jail has ended."""
+"""The longest that ``close`` waits for another thread to notice the end of the jail."""
 _GOING_S = 30.0
-"""How long a jail that is given up may take to go: its ``close``, and its processes' ends."""
+"""How long a jail that is given up may take to run its ``close`` and end its processes."""
 
 
 class Prewarm:
-    """Starts one environment, and cancels a start ahead that no request has used.
+    """Starts the processes of one environment, and cancels a start ahead that was never used.
 
     Attributes:
-        unused: Whether it was started ahead, and no reset came yet.
+        unused: Whether the environment was started ahead and has had no reset yet.
         first_use: Called at the first request; None afterwards.
-        starting: The deadline of a start ahead, while that runs and holds the use lock.
+        starting: The deadline of a start ahead that is running and holds the use lock; else None.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Prewarm:
         self._started()
 
     def adopt(self, loaded: LoadedJail) -> None:
-        """Use a jail that is already loaded, instead of opening one later."""
+        """Build in a jail that is loaded already, instead of opening one later."""
         with self._use.hold("make_env"):
             self._lease.adopt(loaded, Deadline(self._timeouts.startup_s))
             self._started()
@@ -90,14 +90,14 @@ class Prewarm:
     # --- ahead of requests -----------------------------------------------------------------------
 
     def start_in_background(self) -> None:
-        """Start its processes in a thread of their own, unless they are there."""
+        """Start the processes in a thread, unless they are started already."""
         if self.lifecycle.state is State.IDLE:
             threading.Thread(target=self.start, name="envhub-prewarm", daemon=True).start()
 
     def start(self) -> None:
-        """Start its processes, unless they are there, before any request needs them."""
+        """Start the processes ahead of any request, unless they are started already."""
         deadline = StartupDeadline(self._timeouts.startup_s, unasked=True)
-        # whatever fails here fails again in the first request, which raises it
+        # errors are dropped: the first request tries again, and raises its error
         with contextlib.suppress(Exception), self._use.hold("make_env"):
             if self.lifecycle.state is State.IDLE:
                 self.starting = deadline
@@ -108,20 +108,20 @@ class Prewarm:
                     self.starting = None
 
     def cancel(self) -> bool:
-        """Give up processes that were started ahead and never used; whether there were any."""
+        """End processes that were started ahead and never used; returns whether there were any."""
         starting = self.starting
         if starting is not None:
             starting.give_up()
         lock = self._use.lock
         if not lock.acquire(timeout=0 if starting is None else INTERRUPT_S):
-            return False  # it is in use
+            return False  # a request holds the lock
         try:
             unused = self.unused and not self._counters.requests
             if not unused or self.lifecycle.state is not State.READY:
                 return starting is not None
             with self._use.hold("make_env"):
                 self.unused = False
-                # interruption.md, rule 1: the move comes first, so that a reset starts another
+                # interruption.md, rule 1: the state moves first, so a reset starts another jail
                 self.lifecycle.moved(Event.EXPIRY)
                 self._lease.close_politely()
                 self._lease.give_back()
@@ -131,7 +131,7 @@ class Prewarm:
             lock.release()
 
     def look_whether_it_lives(self) -> None:
-        """Before a reset, treat what was started ahead and died unused as expired."""
+        """Before a reset, move to EXPIRED if a jail that was started ahead has died unused."""
         if not self.unused:
             return
         self.unused = False
@@ -147,29 +147,29 @@ class Prewarm:
     def on_first_use(
         self, first_use: Callable[[], None] | None, make_room: Callable[[], bool]
     ) -> None:
-        """Set what to call at the first request, and when a server has no room."""
+        """Set the functions to call at the first request, and when a server has no room."""
         self.first_use, self._lease.make_room = first_use, make_room
 
     def note_use(self) -> None:
-        """Tell of the first request."""
+        """Call ``first_use``, once."""
         if self.first_use is not None:
             first_use, self.first_use = self.first_use, None
             first_use()
 
 
 _Task = tuple["weakref.ref[Prewarm]", ...]
-"""The workers of one environment; weak, for an environment without an owner is closed."""
+"""The workers of one environment; weak, so that an environment without an owner is closed."""
 
 
 class SuitePrewarm:
-    """Starts the tasks after the one that was used last, and cancels those that were passed over.
+    """Starts the tasks that follow the last used one, and cancels tasks that were skipped.
 
-    Thread-safe. Each task is started in a thread of its own, so that where starting takes longer
-    than playing, the next start begins while a request waits for the one before it.
-    ``suites``: the tasks of each suite in order, each as its workers, of which most have one.
-    ``count``: how many tasks after the last one are started ahead, and so how many unused jails
-    there are at most. None: one, once tasks are seen to be closed before the next is used; so a use
-    of just one task, or of all at once, starts nothing ahead.
+    Thread-safe. Each task is started in a thread of its own. So if a start takes longer than
+    playing, the next start begins while a request still waits for the last one.
+    ``suites``: the tasks of each suite in order; each task is the sequence of its workers.
+    ``count``: how many tasks to start ahead, and so the largest number of unused jails. None means
+    one, but only after a task was closed before the next was used: a program that uses one task,
+    or all at once, starts nothing ahead.
     """
 
     def __init__(self, suites: Sequence[Sequence[Sequence[Prewarm]]], count: int | None) -> None:
@@ -182,23 +182,23 @@ class SuitePrewarm:
         self._ahead: list[_Task] = []  # started here and not used yet
         self._cancelling = 0
         for task in chain.from_iterable(self._suites):
-            hash(task)  # computed now and kept: it cannot be once the workers have gone
+            hash(task)  # weak references keep a hash that was computed while their object lived
             for worker in _living(task):
                 worker.on_first_use(partial(self._used, task), self.make_room)
 
     def make_room(self) -> bool:
-        """Cancel all unused starts, since a server has no room; whether there were any."""
+        """Cancel all unused starts, since a server has no room; returns whether there were any."""
         with self._lock:
             self._wanted = []
             ahead, self._ahead = self._ahead, []
             going = self._cancelling > 0
         cancelled = [worker.cancel() for task in ahead for worker in _living(task)]
-        with self._lock:  # what other threads cancel makes room, too, once it has gone
+        with self._lock:  # jails that other threads are cancelling make room, too, once they end
             self._cancelled.wait_for(lambda: not self._cancelling, _GOING_S)
         return going or any(cancelled)
 
     def _used(self, used: _Task) -> None:
-        """A task has its first request, to whichever of its workers."""
+        """Note the first request to a task, and start the tasks that follow it."""
         for worker in _living(used):
             worker.first_use = None
         with self._lock:
@@ -208,9 +208,10 @@ class SuitePrewarm:
             self._start_threads()
 
     def _start_threads(self) -> None:
-        """Cancel or start each task in a thread of its own. The lock is held.
+        """Cancel or start tasks, each in a thread of its own. The caller holds the lock.
 
-        A lack of threads is logged: the caller's request is for another task and must not fail.
+        If no thread can be started, that is only logged: the caller's request is to another task
+        and must not fail.
         """
         while (todo := self._next()) is not None:
             thread = threading.Thread(
@@ -237,7 +238,7 @@ class SuitePrewarm:
 
     def _run(self, task: list[Prewarm], start: bool) -> None:
         try:
-            with contextlib.suppress(Exception):  # a request for it meets the same failure
+            with contextlib.suppress(Exception):  # the first request to the task fails the same way
                 if start and len(task) > 1:
                     from envhub_sandbox.system.threads import Calls  # which few need
 
@@ -255,8 +256,8 @@ class SuitePrewarm:
     def _next(self) -> tuple[list[Prewarm], bool] | None:
         """The next task to cancel (False) or to start (True).
 
-        Nothing starts before all cancelled ones have gone, so there are never more unused jails
-        than the count.
+        Nothing starts before all cancelled tasks have ended, so there are never more than
+        ``count`` unused jails.
         """
         for task in [task for task in self._ahead if task not in self._wanted]:
             self._ahead.remove(task)

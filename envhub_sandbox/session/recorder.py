@@ -1,4 +1,4 @@
-"""Records what an environment is asked, and what led to a death.
+"""Records an environment's requests, to write a crash bundle after a death.
 
 The core's recorder records nothing. The extra ``extras.crash`` has one that writes crash bundles.
 """
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Crash:
-    """What is known of one death.
+    """The facts about one death.
 
     Attributes:
-        error: What the user gets.
+        error: The error that the caller gets.
         load: The arguments of the repository's ``make_env``.
-        options: The other arguments that differ from the default ones.
+        options: The other arguments that differ from their defaults.
         task: ``suite``, ``task``, ``num_envs``, ``shards``, ``lane``; None before ``make_env`` has
             returned.
     """
@@ -41,20 +41,20 @@ class Recorder:
     """Records nothing. Not thread-safe: the environment that owns it holds a lock."""
 
     def started(self) -> None:
-        """A fresh jail, or one in which some sub-environments are in a fresh process."""
+        """Note that some or all sub-environments run in new processes."""
 
     def step(self, actions: Any) -> None:
-        """A step of all sub-environments, with its validated batch of actions."""
+        """Record a step of all sub-environments, with its validated batch of actions."""
 
     def requested(self, request: Request) -> None:
-        """Another request, as it was sent."""
+        """Record any other request, as it was sent."""
 
     def of_part(self) -> Recorder:
-        """The recorder of one worker of a fleet, which has this one for the whole environment."""
+        """The recorder for one worker, when this recorder is for the whole environment."""
         return self
 
     def write(self, folder: Path, crash: Crash) -> Path | None:
-        """Write a crash bundle; returns its folder. Raises ``OSError``."""
+        """Write a crash bundle; returns its folder, or None for no bundle. Raises ``OSError``."""
 
 
 def recorder_for(limit: int) -> Recorder:

@@ -1,7 +1,7 @@
-"""``restart="transparent"``: a request goes on although runners have died.
+"""``restart="transparent"``: a request is completed although runners have died.
 
-The dead shards come back in fresh runners, seeded anew, with the attributes that were set; the
-others go on. Without it there is no ``Recovery``, and a death is an error.
+New runners replace the dead ones, with new seeds and the attributes that the caller has set; the
+other runners continue. With another ``restart`` there is no ``Recovery``, and a death is an error.
 """
 
 from __future__ import annotations
@@ -29,16 +29,17 @@ if TYPE_CHECKING:
     from envhub_sandbox.transport.lane import Lane
 
 RESTARTED = "worker_restarted"
-"""The key in the infos: whether a sub-environment was lost and came back reset."""
+"""The key in infos that says whether a sub-environment was lost and restarted."""
 _SETTINGS = 256
-"""How many attributes are remembered."""
+"""The most attributes whose values are remembered."""
 _SETTERS = frozenset({"__setattr__", "set_wrapper_attr"})
 """Methods of sub-environments that set an attribute."""
 
 
 class Recovery:
-    """Brings back the dead shards of one environment.
-    ``fresh``: those that came back in the last request.
+    """Restarts the dead shards of one environment, in this order: fork new runners, build, set the
+    remembered attributes, then repeat the request.
+    ``fresh``: the shards that were restarted in the last request.
     """
 
     def __init__(
@@ -53,19 +54,19 @@ class Recovery:
         self._counters = lease.counters
         self._recorder = recorder
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
-        self._settings: dict[Any, list[list[bytes]]] = {}  # what was set, as shards were sent it
-        self._setting: tuple[Any, list[list[bytes]]] | None = None  # what is being set
+        self._settings: dict[Any, list[list[bytes]]] = {}  # by target: each shard's frames
+        self._setting: tuple[Any, list[list[bytes]]] | None = None  # set by the pending request
         self._asked: Sequence[m.Message] = ()
         self.fresh: tuple[int, ...] = ()
 
     # --- requests --------------------------------------------------------------------------------
 
     def started(self) -> None:
-        """Forget attributes that were set: the jail is a fresh one."""
+        """Forget the attributes that were set, since the jail is new."""
         self._settings.clear()
 
     def sent(self, request: Request) -> None:
-        """Remember the seeds and attributes of a request that has gone out."""
+        """Remember the seeds and attributes of a request that was sent."""
         self._asked = messages = request.messages
         self._setting, self.fresh = None, ()
         for message, (start, _) in zip(messages, self._bounds, strict=True):
@@ -76,10 +77,10 @@ class Recovery:
             self._setting = target, request.kept()
 
     def answered(self) -> None:
-        """Every shard has answered the request, and none raised: remember what it set."""
+        """Remember the attribute that a request has set, since no shard raised."""
         if self._setting is not None:
             target, sent = self._setting
-            self._settings.pop(target, None)  # the last one counts, in its place
+            self._settings.pop(target, None)  # so that the order is that of the last settings
             self._settings[target] = sent
             if len(self._settings) > _SETTINGS:
                 del self._settings[next(iter(self._settings))]
@@ -89,16 +90,16 @@ class Recovery:
 
     def deaths_of_all(self, error: WorkerError) -> RunnersDiedError:
         """Treat the end of the jail as the death of all shards."""
-        if not isinstance(error, WorkerDiedError):  # another environment there has given it up
+        if not isinstance(error, WorkerDiedError):  # another environment has given the jail up
             error = WorkerDiedError(str(error), reason="killed")
         shards = range(len(self._bounds))
         replies: list[m.Message | None] = [None for _ in shards]
         return RunnersDiedError(replies, dict.fromkeys(shards, error), jail_gone=True)
 
     def survive_request(self, deaths: RunnersDiedError) -> list[m.Message]:
-        """The replies to a reset, which fresh runners repeat.
-        Raises ``WorkerDiedError``: it was another request, which is not repeated; the next step or
-        reset restarts the dead.
+        """The replies to a reset, which new runners repeat for the dead shards.
+        Raises ``WorkerDiedError``: the request was not a reset, and is not repeated; the next step
+        or reset restarts the dead shards.
         """
         replies = self._of_survivors(deaths)
         if self._lifecycle.request != "reset":
@@ -107,21 +108,21 @@ class Recovery:
         return self._revive(replies, deaths, "reset")
 
     def survive_step(self, deaths: RunnersDiedError) -> list[m.StepDone]:
-        """The replies to a step, with truncated rows in the place of the dead."""
+        """The replies to a step, with truncated rows for the dead shards."""
         replies = self._of_survivors(deaths)
         merged = self._revive(replies, deaths, "step")
         return [typed_reply(reply, m.StepDone) for reply in merged]
 
     def mark(self, infos: dict[Any, Any]) -> dict[Any, Any]:
-        """Infos of the last request, with marks for the shards that were restarted."""
+        """Add marks for the restarted shards to the infos of the last request."""
         if not self.fresh:
             return infos
         results = self._lease.results
         return mark_revived(infos, results.count, [results.slices[index] for index in self.fresh])
 
     def _of_survivors(self, deaths: RunnersDiedError) -> list[m.Message | None]:
-        """The replies of the others, and None for the dead.
-        Raises ``RemoteEnvError``: one of the others raised; the next request meets the deaths.
+        """The replies of the living shards, and None for the dead.
+        Raises ``RemoteEnvError``: a living shard raised; the next request handles the deaths.
         """
         try:
             for reply in deaths.replies:
@@ -135,7 +136,10 @@ class Recovery:
     def _revive(
         self, replies: list[m.Message | None], deaths: RunnersDiedError, operation: str
     ) -> list[m.Message]:
-        """Restart the dead shards, and move to the state that follows; returns all replies."""
+        """Restart the dead shards; returns the replies of all shards."""
+        # LOSS moves the state from PENDING to REVIVING. From there REVIVAL moves to READY,
+        # a timeout or an interrupt to LATE, and any other error to DEAD. ``fresh``, the counters
+        # and the recorder are up to date before READY, from which the next request may start.
         lifecycle, failures = self._lifecycle, self._failures
         lifecycle.moved(Event.LOSS)
         failures.keep_crash(deaths.first)
@@ -146,7 +150,7 @@ class Recovery:
         except WorkerTimeoutError as error:
             if lifecycle.closed:
                 raise failures.dead(error) from error
-            lifecycle.request = None  # how far it came is not known: a reset starts afresh
+            lifecycle.request = None  # its progress is unknown, so the next reset takes a new jail
             failures.interruption = None
             lifecycle.moved(Event.TIMEOUT)
             raise
@@ -166,9 +170,9 @@ class Recovery:
         return [reply for reply in merged if reply is not None]
 
     def _bring_back(self, deaths: RunnersDiedError, operation: str) -> dict[int, m.Message]:
-        """Restart the dead shards; returns the last reply of each fresh runner."""
+        """Restart the dead shards; returns the last reply of each new runner."""
         if any(death.reason == "protocol" for death in deaths.deaths.values()):
-            raise deaths.first  # after a broken rule there is no second chance
+            raise deaths.first  # a worker that violates the protocol is not restarted
         try:
             self._restarts.spend(operation)
         except WorkerDiedError as spent:
@@ -176,7 +180,7 @@ class Recovery:
         dead = sorted(deaths.deaths)
         rows = [row for index in dead for row in range(*self._bounds[index])]
         why, label = str(deaths.first).partition("\n")[0], self._lease.repository.label
-        # which the caller sees in the infos only
+        # logged, since the caller sees the restart in the infos only
         WORKER.info("%s: %s; sub-environments %s start again in new processes", label, why, rows)
         timeouts = self._lease.repository.timeouts
         deadline = StartupDeadline(timeouts.startup_s)
@@ -199,7 +203,7 @@ class Recovery:
             raise self._failures.late("reset", deadline_of_reset) from error
 
     def _set_again(self, lane: Lane, dead: Sequence[int], deadline: Deadline) -> None:
-        """Set attributes again in fresh runners; an exception of a setter is only logged."""
+        """Set the remembered attributes in new runners; a setter's exception is only logged."""
         for (name, *_), frames in list(self._settings.items()):
             requests: list[tuple[int, list[Buffer]]] = [
                 (lane.runners[index], [*frames[index]]) for index in dead
@@ -213,7 +217,7 @@ class Recovery:
                     typed_reply(reply, m.Value)
 
     def _messages(self, lane: Lane, index: int, operation: str) -> list[m.Message]:
-        """The requests to a shard's fresh runner, in order."""
+        """The requests to a dead shard's new runner, in order."""
         seeds = self._seeds.derived(self._bounds[index], self._counters.restarts)
         if operation == "step":
             return [m.Revive(lane.number, seeds)]
@@ -222,7 +226,7 @@ class Recovery:
         return resets(reset, seeds)
 
     def _revived(self, index: int, operation: str, answer: m.Message) -> m.Message:
-        """The reply for a dead shard, made of its fresh runner's. Trust: input from the worker."""
+        """A dead shard's reply, from its new runner's answer. Trust: input from the worker."""
         start, stop = self._bounds[index]
         if operation == "step":
             return revived_step(typed_reply(answer, m.StepDone), stop - start)
@@ -231,14 +235,15 @@ class Recovery:
 
 
 def _target_of(messages: Sequence[m.Message]) -> tuple[Any, ...] | None:
-    """The attribute that a request sets, and where; None if it sets none."""
+    """The name of the attribute that a request sets, and in which environments; or None."""
     first = messages[0]
     if isinstance(first, m.SetAttr):
         return (first.name,)
     calls = [message for message in messages if isinstance(message, (m.Call, m.CallOne))]
     if not calls or calls[0].name not in _SETTERS:
         return None
-    args = max((call.args for call in calls), key=len)  # one has them where only one is meant
+    # if one sub-environment is meant, only the call to its shard has the arguments
+    args = max((call.args for call in calls), key=len)
     if not args or not isinstance(args[0], str):
         return None
     targets = [(getattr(call, "index", None), getattr(call, "depth", None)) for call in calls]
@@ -246,10 +251,10 @@ def _target_of(messages: Sequence[m.Message]) -> tuple[Any, ...] | None:
 
 
 def revived_step(reply: m.StepDone, count: int) -> m.StepDone:
-    """The rows of a restarted shard in the step in which it died. Trust: its flags are not used.
+    """The rows of a restarted shard for the step in which it died. Trust: its flags are not used.
 
-    The shape of its rewards is used only if they are an array, whose size was paid for in bytes: a
-    described space has a ``shape`` of any size for a few.
+    The shape of its rewards is used only if they are an array, which took that many bytes to send:
+    a described space could claim a ``shape`` of any size in a few bytes.
     """
     rewards: Any = reply.rewards
     return m.StepDone(
@@ -275,11 +280,11 @@ def mark_revived(
 
 
 class SeedBook:
-    """The last seeds of sub-environments, and the seeds of those that are restarted.
+    """Remembers the last seeds of sub-environments, and derives the seeds after a restart.
 
-    A seed after a restart is derived from the caller's, so that a run can be repeated; without one,
-    the environment draws its own.
-    ``each``: whether sub-environments are seeded one by one, and not by the environment itself.
+    The seed after a restart is derived from the caller's seed, so that a run can be repeated.
+    Without a caller's seed, the environment draws its own.
+    ``each``: whether each sub-environment has a seed; else a repository's own class has one seed.
     """
 
     def __init__(self, num_envs: int, each: bool) -> None:
@@ -288,7 +293,7 @@ class SeedBook:
         self._own: Any = None
 
     def remember(self, reset: m.Reset, start: int = 0) -> None:
-        """Remember the seeds of a reset of sub-environments from ``start`` on, or of its mask."""
+        """Remember a reset's seeds, of sub-environments from ``start`` on, within its mask."""
         seeds: Any = reset.seeds
         if seeds is None:
             return
@@ -301,7 +306,7 @@ class SeedBook:
                 self._last[index] = seed
 
     def derived(self, bounds: tuple[int, int], restart: int) -> Any:
-        """Seeds for the sub-environments of a shard that comes back."""
+        """The seeds for the sub-environments of a restarted shard."""
         seeds = self._last[slice(*bounds)] if self._each else self._own
         if isinstance(seeds, list):
             return [derived_seed(seed, restart) for seed in seeds]
@@ -309,17 +314,17 @@ class SeedBook:
 
 
 def derived_seed(seed: int | None, restart: int) -> int | None:
-    """The seed after the ``restart``-th restart of what was last seeded with ``seed``."""
+    """The seed after the ``restart``-th restart, derived from the last seed."""
     if seed is None:
         return None
     return int(np.random.SeedSequence((abs(seed), restart)).generate_state(1)[0])
 
 
 def resets(message: m.Reset, derived: Any) -> list[m.Message]:
-    """The requests to a fresh runner in place of one that died in a reset.
+    """The requests to a new runner that replaces one that died in a reset.
 
-    It is the same reset, with derived seeds where the caller gave none. If it has a mask, all
-    sub-environments are reset before it.
+    They are the same reset, with derived seeds where the caller gave none. If it has a mask, a
+    reset of all sub-environments comes first.
     """
     if message.mask is not None:
         return [m.Reset(message.env, derived, None, None), message]

@@ -1,8 +1,9 @@
-"""One repository under one policy: what all its environments share, and the errors of its start.
+"""One repository under one policy: the state that its environments share, and errors of its start.
 
-``provenance_of`` says what ran. A pickle of a proxy holds a ``Recipe``, the arguments that made it,
-and makes a fresh environment of the same commit in a worker of its own. It never holds a token or a
-login: the other side uses its own. ``plain_config`` makes plain data of a caller's config object.
+``provenance_of`` describes what ran. A pickle of a proxy contains a ``Recipe``, the arguments that
+made it; unpickling makes a new environment of the same commit in a worker of its own. The recipe
+never contains a token or a login: the process that unpickles it uses its own. ``plain_config``
+converts a caller's config object to plain data.
 """
 
 from __future__ import annotations
@@ -53,15 +54,15 @@ _PLAIN = (type(None), bool, int, float, complex, str, bytes, np.ndarray, np.gene
 _MAX_DEPTH = 16
 _LEFT_OUT = object()
 ENV_ID = "Hub-v0"
-"""What Gymnasium calls every environment of ours."""
+"""The id of all our environments for Gymnasium."""
 _MAKERS = "envhub_sandbox.integrations.gym"
 _SPEC_FACTS = frozenset({"max_episode_steps", "reward_threshold", "nondeterministic"})
-"""What is true of the environment in a sandbox as well."""
+"""The facts of a repository's spec that also hold in a sandbox."""
 
 
 @dataclass(frozen=True)
 class PlainConfig:
-    """The plain data of a caller's config object, which ``make_env`` takes in its place."""
+    """The plain data of a caller's config object; ``make_env`` takes it like the object."""
 
     hub_path: str
     values: dict[str, object]
@@ -72,7 +73,7 @@ class Recipe:
     """The arguments of ``make_env``, with the commit pinned.
 
     Attributes:
-        make_env: The function that takes them; it travels by its name.
+        make_env: The function to call; a pickle contains only its name.
         reference: The pinned hub reference, or a local folder and its entry file.
         config: The caller's config object as plain values, or None.
     """
@@ -89,17 +90,17 @@ class Recipe:
             object.__setattr__(self, "options", plain)
 
     def make(self) -> Any:
-        """Fresh environments: what ``make_env`` returns and raises."""
+        """Make new environments; returns and raises as ``make_env``."""
         return self.make_env(self._cfg, **self._options)
 
     def make_one(self, suite: str, task: int | str) -> Any:
-        """One fresh environment of them."""
+        """Make new environments, and return one of them."""
         return self.make()[suite][task]
 
     def spec(self, suite: str, task: int | str, facts: Mapping[str, Any] | None) -> EnvSpec:
-        """A spec from which ``gym.make`` makes one environment again, in a sandbox.
-        ``facts``: those of the repository's own spec. Trust: input from the worker, of which
-        nothing says how the environment is made.
+        """A spec from which ``gym.make`` makes this environment again, in a sandbox.
+        ``facts``: the fields of the repository's own spec. Trust: input from the worker; none of
+        its fields that say how to make an environment is used.
         """
         safe_facts = {name: value for name, value in (facts or {}).items() if name in _SPEC_FACTS}
         if (safe_facts.get("max_episode_steps") or 0) < 1:
@@ -122,12 +123,12 @@ class Recipe:
     def _options(self) -> dict[str, Any]:
         options = dict(self.options)
         if options.get("endpoint") == without_login(default_endpoint()):
-            options["endpoint"] = None  # it may come with a login here
+            options["endpoint"] = None  # the default may have a login here
         return options
 
     @property
     def differing(self) -> dict[str, Any]:
-        """The options that are not the default ones, as JSON has them where it can."""
+        """The options that differ from their defaults, as values for JSON where possible."""
         default = Options()
         return {
             name: plain
@@ -145,8 +146,8 @@ def provenance_of(
     profile: str | None = None,
     places: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """What ran, as plain data: enough to run it again, or to see that it cannot be the same.
-    ``report``: the layers of confinement. Trust: interpreter and packages are the worker's words.
+    """Describes a run as plain data: enough to repeat it, or to see why it cannot be repeated.
+    ``report``: the layers of confinement. Trust: the worker says which interpreter and packages.
     """
     return {
         "repository": snapshot.repo_id,
@@ -166,7 +167,7 @@ def provenance_of(
 
 
 def _differences(value: Any) -> Any:
-    """The fields of a policy, timeouts or limits that differ from the default; other values."""
+    """The non-default fields of a policy, timeouts or limits; any other value unchanged."""
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     if not isinstance(value, (Policy, Timeouts, Limits)):
@@ -185,23 +186,23 @@ def _no_advice(subject: object) -> str:
 
 
 class Repository:
-    """What the environments of one ``make_env`` have in common. Opens nothing: see ``Launcher``.
+    """The state that the environments of one ``make_env`` share. ``Launcher`` opens its jails.
 
     Args:
-        arguments: Those of the repository's ``make_env``.
+        arguments: The arguments for the repository's ``make_env``.
         runtime: The interpreter and the packages of the jails.
         copy: Whether observations are copied for the caller, or lent.
-        installed: What was installed for it, for the provenance.
-        advice: Makes advice about a missing module, for the error's text.
-        of_its_day: Makes advice if today's packages may be at fault; empty for other errors.
+        installed: The packages that were installed for it, for the provenance.
+        advice: Returns advice about a missing module, for the error's text.
+        of_its_day: Returns advice if today's packages may be at fault; empty for other errors.
 
     Attributes:
         label: Repository, commit and entry file, for errors.
-        wire_limits: Bounds on what a jail may send.
-        warnings: Warnings of the repository in any jail.
+        wire_limits: Bounds on a jail's messages.
+        warnings: The warnings of the repository in all jails.
         latest_report, latest_profile: The layers and the profile of the jail that was opened last.
-        places: Where each worker of an environment runs, or will run.
-        jail_numbers: Numbers the jails, for files of their output.
+        places: The address where each worker runs or will run.
+        jail_numbers: Counts the jails, to name the files of their output.
         for_lerobot: Whether LeRobot's programs use it: see ``serve_lerobot``.
     """
 
@@ -244,7 +245,7 @@ class Repository:
         self._of_its_day = of_its_day
 
     def hold(self, holder: object) -> None:
-        """Keep its files and packages from being removed, until each holder has let go."""
+        """Lock the files and packages against removal until each holder has called ``let_go``."""
         self._holders.add(holder)
         self._lock_files()
 
@@ -252,12 +253,12 @@ class Repository:
         if self._in_use:
             return
         folders = [snapshot.root.parent for snapshot in (self.snapshot, *self.snapshot.assets)]
-        if os.path.isabs(self.runtime.packages):  # else they have a name, on another host
+        if os.path.isabs(self.runtime.packages):  # else a name on another host
             folders.append(Path(self.runtime.packages).with_name(RECORD))
         self._in_use = [SharedLock(folder) for folder in folders]
 
     def let_go(self, holder: object) -> None:
-        """Let the files be removed, after the last holder. Idempotent, also after an interrupt."""
+        """Release the locks after the last holder. Idempotent, even after an interrupt."""
         self._holders.discard(holder)
         if self._holders:
             return
@@ -267,7 +268,9 @@ class Repository:
 
     @contextmanager
     def named(self) -> Iterator[None]:
-        """Put the repository's name in front of the errors of this project."""
+        """Add the repository's name, advice and the author's line to errors of this project."""
+        # The order matters: ``add_author_line`` sets ``__notes__``, by which the other steps see
+        # that an error has passed here before, so it comes last.
         try:
             yield
         except EnvHubError as error:
@@ -288,14 +291,14 @@ class Repository:
     def provenance(
         self, manifest: Manifest | None, report: list[dict[str, Any]] | None = None
     ) -> dict[str, Any]:
-        """What runs: see ``provenance_of``. ``report``: None for that of the latest jail."""
+        """``provenance_of`` this run; ``report``: None for the layers of the latest jail."""
         layers = self.latest_report if report is None else report
         run = self.installed, self.latest_profile, self.places
         return provenance_of(self.snapshot, manifest, layers, *run)
 
     @contextmanager
     def starting(self, deadline: Deadline) -> Iterator[None]:
-        """Say in an error what took too long, and write a crash bundle for a death."""
+        """Turn a timeout or death during the start into the caller's error, with a crash bundle."""
         try:
             yield
         except WorkerDiedError as error:
@@ -327,9 +330,9 @@ class Repository:
         manifest: Manifest | None = None,
         report: list[dict[str, Any]] | None = None,
     ) -> None:
-        """Write a crash bundle and name it in the error. What hinders that is only logged.
+        """Write a crash bundle and name it in the error. Failing to write it is only logged.
 
-        All but the error is None before there is a jail.
+        Arguments other than ``error`` are None before there is a jail.
         """
         ended = getattr(error, "reason", "") in ("killed", "idle", "gone", "connection")
         if ended or not self.policy.crash_history or error.bundle is not None:
@@ -351,7 +354,7 @@ class Repository:
         if bundle is None:
             return
         error.bundle = str(bundle)
-        # a bundle elsewhere than in the cache might be anybody's
+        # a bundle outside of the cache may be a stranger's: replay needs --grant
         options = " --grant" if self.policy.crash_folder else ""
         again = f"To try the same again: envhub replay {shlex.quote(error.bundle)}{options}"
         error.args = (f"{error.args[0]}\n{again}", *error.args[1:])
@@ -362,11 +365,11 @@ class Repository:
 
 
 def plain_config(config: Any) -> dict[str, object]:
-    """The attributes of a config object with nested ones, and its own public properties.
+    """The attributes of a config object, also of nested objects, and its public properties.
 
-    Dataclasses and other plain objects become mappings which say what their classes are called
-    (``messages.CONFIG_CLASS``), and so do members of enums and paths. What has no plain form (a
-    function, an open file) is left out: nothing of the caller is pickled.
+    Dataclasses, other plain objects, enum members and paths become mappings with the names of
+    their classes (``messages.CONFIG_CLASS``). Values without a plain form (a function, an open
+    file) are left out, because nothing of the caller is pickled.
     """
     return config.values if isinstance(config, PlainConfig) else _attributes(config, 0)
 
@@ -396,12 +399,12 @@ def _known(values: dict[Any, Any]) -> dict[Any, Any]:
 
 
 def _names(kind: type) -> tuple[tuple[str, str], ...]:
-    """Module and name of a class and of those that it inherits from."""
+    """The module and name of a class and of each of its base classes."""
     return tuple((cls.__module__, cls.__qualname__) for cls in kind.__mro__ if cls is not object)
 
 
 def _computed(config: Any, depth: int) -> Iterator[tuple[str, Any]]:
-    """The public properties of a config that can be had: LeRobot's have their ``type`` so."""
+    """The public properties of a config that can be read, such as ``type`` of LeRobot's."""
     kind = type(config)
     for name in [] if depth else dir(kind):
         if name.startswith("_") or not isinstance(inspect.getattr_static(kind, name), property):

@@ -1,11 +1,11 @@
-"""The requests of one environment: one at a time, none after ``close``, and their answers.
+"""The requests of one environment and their answers: one at a time, and none after ``close``.
 
-The caller's rules and errors are those of ``gymnasium.vector.AsyncVectorEnv``. ``Lifecycle`` says
-which requests are legal, the lane takes each to the shards, and a ``Recovery``, if there is one,
-repeats what dead shards did not finish.
+The rules and errors for the caller are those of ``gymnasium.vector.AsyncVectorEnv``. ``Lifecycle``
+says which requests are legal, the lane sends each request to the shards, and a ``Recovery``, if
+there is one, repeats a request that dead shards did not finish.
 
-Where order matters here, docs/internals/interruption.md says why, by the rule's number: the
-lifecycle moves before a message goes out and after its replies are in.
+The lifecycle moves before a message is sent and after its replies are in.
+docs/internals/interruption.md gives the reasons; comments name its rules by number.
 """
 
 from __future__ import annotations
@@ -49,18 +49,19 @@ if TYPE_CHECKING:
 
 Bounds = tuple[int, int]
 MessageFor = Callable[[int, Bounds], m.Message]
-"""Makes the message for a shard out of the environment's number and the shard's bounds."""
+"""Makes the message for a shard, from the environment's number and the shard's bounds."""
 OneMessageFor = Callable[[int, "int | None"], m.Message]
-"""Makes it of the number and the sub-environment's place in the shard; None in other shards."""
+"""Makes the message from the number and the sub-environment's index in the shard, or None for a
+shard without the sub-environment."""
 SENT = "send"
-"""What is pending between ``send`` and ``recv``, as ``RequestOrder.waiting`` calls it."""
+"""The value of ``RequestOrder.waiting`` between ``send`` and ``recv``."""
 _SHOWN = 64
-"""Characters of an attribute's name in the name of a request."""
+"""The most characters of an attribute's name in a request's name."""
 T = TypeVar("T")
 
 
 def for_every_shard(kind: Callable[..., m.Message], *fields: object) -> MessageFor:
-    """The same message for each shard of an environment, after the environment's number."""
+    """Returns a function that makes the same message for each shard of an environment."""
 
     def message_for(number: int, bounds: Bounds) -> m.Message:
         return kind(number, *fields)
@@ -69,18 +70,18 @@ def for_every_shard(kind: Callable[..., m.Message], *fields: object) -> MessageF
 
 
 class RequestOrder(ABC):
-    """The caller's order of requests to one environment, in one jail or in several.
+    """Keeps the order of the caller's requests to one environment, in one jail or several.
 
     Attributes:
         results: Turns replies into what Gymnasium returns.
         closed: Whether the caller has called ``close``.
-        waiting: The request of an ``*_async`` whose ``*_wait`` has not come yet.
+        waiting: The request whose ``*_async`` was called and whose ``*_wait`` was not, or None.
         face: The name of the environment's class in the error after ``close``.
         attributes: Answers reads of attributes that need no request.
         use: Its lock is held from before a request until its answer is handled; between an
             ``*_async`` and its ``*_wait`` it is free.
-        stepping: The thread that is in a step, unless it was interrupted there.
-        before_request, after_request: Keep the caller's random generators up to date, if any.
+        stepping: The id of the thread that is in a step, or None.
+        before_request, after_request: Keep the caller's random generators up to date, if set.
     """
 
     def __init__(
@@ -106,7 +107,7 @@ class RequestOrder(ABC):
         self._warned_of_two = False
 
     def warn_of_two(self, thread: int) -> None:
-        """Warn, once, where another thread is in a step: both get results, of one another's."""
+        """Warn once if another thread is in a step, because the two mix up their episodes."""
         if self.stepping in (None, thread) or self._warned_of_two:
             return
         self._warned_of_two = True
@@ -154,15 +155,15 @@ class RequestOrder(ABC):
         return self._ask(operation, message_for, m.Value, self._timeouts.call_s)
 
     def ask_own(self, operation: str, kind: Callable[..., m.Message], *fields: object) -> m.Message:
-        """Ask the repository's own vector environment, which is in one shard."""
+        """Ask the repository's own vector environment, which has one shard; returns its reply."""
         kinds = (m.Value, m.Method)
         message_for = for_every_shard(kind, *fields)
         [reply] = self._ask(operation, message_for, kinds, self._timeouts.call_s)
         return reply
 
     def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
-        """Ask one sub-environment; the replies of other shards are empty."""
-        operation = f"envs[{index}].{name[:_SHOWN]}"  # which is no reset or step of all
+        """Ask one sub-environment; returns its reply, while other shards reply without a value."""
+        operation = f"envs[{index}].{name[:_SHOWN]}"  # unlike "reset" and "step" of all
         timeouts = {"reset": self._timeouts.reset_s, "step": self._timeouts.step_s}
 
         def message_for(number: int, bounds: Bounds) -> m.Message:
@@ -187,31 +188,31 @@ class RequestOrder(ABC):
             return self.collect(timeout_s, kind)
 
     def note_sent(self, actions: Any | None) -> None:  # noqa: B027  # for several workers
-        """Count a step that was sent; ``actions`` are None where some workers were sent none."""
+        """Count a step that was sent; ``actions`` are None if only some workers got actions."""
 
     @abstractmethod
     def submit(
         self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
     ) -> None:
-        """With the lock held, send a request to every shard."""
+        """Send a request to every shard, with the lock held."""
 
     @abstractmethod
     def collect(
         self, timeout: float | Deadline | None, kind: type[m.M] | tuple[type[m.M], ...]
     ) -> list[m.M]:
-        """With the lock held, the shards' replies to the last ``submit``."""
+        """Wait for the shards' replies to the last ``submit``, with the lock held."""
 
     @abstractmethod
     def one_each(
         self, operation: str, replies: list[m.Value] | list[m.WatchDone]
     ) -> tuple[Any, ...]:
-        """One value for each sub-environment, out of the shards' replies."""
+        """One value for each sub-environment, from the shards' replies."""
 
     def explain(self, error: BaseException) -> None:
-        """Prepare an error for the caller, and show the repository's warnings first.
+        """Prepare for raising an error to the caller: show the repository's warnings first.
 
         A filter that turns a warning into an error must not hide a Ctrl-C.
-        Raises ``ClosedEnvironmentError``: a ``close`` in another thread is the reason.
+        Raises ``ClosedEnvironmentError``: a ``close`` in another thread caused the error.
         """
         with suppress(RemoteEnvWarning):
             self.show_warnings()
@@ -223,7 +224,7 @@ class RequestOrder(ABC):
     def note_answered(self, kind: object = None) -> None:
         """Note that a request was answered, by messages of this ``kind``.
 
-        A reset is only answered after ``finish_reset``, which may ask for its infos again.
+        A reset counts as answered only after ``finish_reset``, which may fetch its infos.
         """
         if self.after_request is not None and kind is not m.ResetDone:
             self.after_request()
@@ -231,14 +232,15 @@ class RequestOrder(ABC):
     def show_warnings(self) -> None:
         """Show the repository's new warnings, after all replies are handled.
 
-        A filter of the caller may raise: that is not the worker's fault, and no reply may be owed.
+        A filter of the caller may raise. That must not count as the worker's fault, and it must
+        leave no reply owed.
         """
         if self._unshown:
             self._repository.warnings.show(self._repository.label)
 
 
 class Requests(RequestOrder):
-    """The requests to one jail, which is opened by the first of them."""
+    """Sends the requests to one jail; the first request opens it."""
 
     use: UseLock
 
@@ -262,10 +264,10 @@ class Requests(RequestOrder):
         self._recovery = recovery
 
     def fall_behind(self) -> None:
-        """Permit only a reset: this worker was not sent a request that others were sent."""
+        """Permit only a reset, since other workers were sent a request and this one was not."""
         if self.lifecycle.state is State.READY:
             self.lifecycle.on(Event.SUBMIT)
-            self.lifecycle.on(Event.TIMEOUT)  # with no request to be late: it begins anew
+            self.lifecycle.on(Event.TIMEOUT)  # LATE without a request: a reset takes a new jail
 
     @property
     def came_back(self) -> bool:
@@ -276,25 +278,25 @@ class Requests(RequestOrder):
 
     # The order of a request, which interruption.md explains by rule:
     #
-    # 1. ``_sending``: the jail is opened, if there is none, and the message is packed. What fails
-    #    here has sent nothing, and the state is what it was.
-    # 2. ``_outgoing``: the state moves to PENDING, and only then the message goes out. After a
+    # 1. ``_sending``: the jail is opened, if there is none, and the message is packed. After a
+    #    failure here nothing was sent, and the state is unchanged.
+    # 2. ``_outgoing``: the state moves to PENDING, and only then the message is sent. After a
     #    Ctrl-C in between, the next request is refused and ``reset`` waits for a reply.
-    # 3. Recovery and recorder note it: it is known to have been sent.
+    # 3. Recovery and recorder note the request, since it was sent.
     # 4. ``_finish``: the replies of all shards are in, and only then the state moves on.
     # 5. ``_incoming``: the replies are decoded and compared with the manifest. A worker that breaks
-    #    a rule in them is given up; no reply is owed any more.
-    # 6. The repository's warnings are shown last: a filter of the caller's may raise, and must find
+    #    the protocol in them is given up; no reply is owed any more.
+    # 6. The repository's warnings are shown last: a filter of the caller may raise, and must leave
     #    an environment that can be used.
 
     def submit(
         self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
     ) -> None:
-        """With the lock held, send a request to every shard; opens the jail if there is none.
+        """Send a request to every shard, with the lock held; opens the jail if there is none.
 
-        ``instead`` makes the messages to send; those of ``message_for`` are only recorded then.
-        Raises ``LocalProtocolError``: it cannot be sent, and nothing was; ``WorkerError``: the
-        environment's state does not permit it.
+        If ``instead`` is given, its messages are sent, and those of ``message_for`` only recorded.
+        Raises ``LocalProtocolError``: a message cannot be sent, and nothing was sent;
+        ``WorkerError``: the environment's state does not permit the request.
         """
         if self.before_request is not None:
             self.before_request()
@@ -311,9 +313,9 @@ class Requests(RequestOrder):
             self._recorder.requested(request)
 
     def make_ready(self, operation: str, start: Callable[[], object] | None = None) -> None:
-        """With the lock held, open the jail if there is none; raises as ``submit`` does.
+        """Open the jail if there is none, with the lock held; raises as ``submit`` does.
 
-        ``start`` gives the result of a start that was tried already: it returns, or raises.
+        ``start``: returns or raises the result of a start that was tried already.
         """
         with self._sending(operation):
             if start is not None:
@@ -344,9 +346,9 @@ class Requests(RequestOrder):
             self._prewarm.note_use()
 
     def submit_alone(self, lane: Lane, operation: str, message: m.Message) -> None:
-        """With the lock held, send a request over a lane to one runner; raises as ``submit`` does.
+        """Send a request to one runner over a lane, with the lock held; raises as ``submit`` does.
 
-        Answers to earlier requests may still be owed, by this runner and by others.
+        This runner and others may still owe answers to earlier requests.
         """
         ready = self.lifecycle.state is State.READY  # otherwise a request is pending already
         with self._sending(operation), self._outgoing(operation, submit=ready):
@@ -358,7 +360,7 @@ class Requests(RequestOrder):
         return lane.jail.request(operation, messages, bounds)
 
     def refuse_whole(self, operation: str, message_for: MessageFor, count: int) -> None:
-        """Raise ``LocalProtocolError`` with the position in all of the caller's arguments."""
+        """Raise ``LocalProtocolError`` with the position in the caller's whole arguments."""
         lane = self._lane()
         lane.jail.request(operation, [message_for(lane.number, (0, count))], [(0, count)])
 
@@ -368,8 +370,8 @@ class Requests(RequestOrder):
         kind: type[m.M] | tuple[type[m.M], ...],
         lane: Lane | None = None,
     ) -> list[m.M]:
-        """With the lock held, wait for the shards' replies to the last request; after
-        ``submit_alone`` for those that are owed to its ``lane``.
+        """Wait for the shards' replies to the last request, with the lock held. After
+        ``submit_alone``, wait for the replies on its ``lane``.
         Raises ``WorkerTimeoutError``: the environment is then LATE: ``reset`` brings it back;
         ``WorkerDiedError``: the environment is then DEAD; with ``restart="transparent"`` READY;
         ``RemoteEnvError``: the repository's code raised; the environment is still usable;
@@ -404,14 +406,14 @@ class Requests(RequestOrder):
     def one_each(
         self, operation: str, replies: list[m.Value] | list[m.WatchDone]
     ) -> tuple[Any, ...]:
-        """See ``RequestOrder``."""
+        """Implements ``RequestOrder.one_each``; gives up a worker with a wrong number of values."""
         with self._incoming():
             return self.results.one_each(operation, replies)
 
     def finish_reset(
         self, replies: list[m.ResetDone], timeout: float | Deadline | None
     ) -> tuple[Any, dict[Any, Any]]:
-        """Turn replies into what ``VectorEnv.reset`` returns; raises as ``collect`` does."""
+        """Turn replies into the result of ``VectorEnv.reset``; raises as ``collect`` does."""
         with self._incoming():
             try:
                 result = self.results.reset(replies)
@@ -428,7 +430,7 @@ class Requests(RequestOrder):
     def submit_step(self, actions: Any, packed: Request | None = None) -> None:
         """Send a validated batch of actions, with the lock held; raises as ``submit`` does.
 
-        ``packed`` is the request, if it was encoded already because the actions have no layout.
+        ``packed``: the encoded request, if the actions have no layout and were encoded already.
         """
         if self.before_request is not None:
             self.before_request()
@@ -443,7 +445,7 @@ class Requests(RequestOrder):
                 lane = self._lease.lane
                 assert lane is not None
                 lifecycle.request = "step"
-                lifecycle.on(Event.SUBMIT)  # interruption.md, rule 1: first
+                lifecycle.on(Event.SUBMIT)  # interruption.md, rule 1: before anything is sent
                 if packed is None:
                     lane.send_step(actions)
                 else:
@@ -453,7 +455,7 @@ class Requests(RequestOrder):
                     self._nothing_was_sent(error)
                     raise
             self._counters.requests += 1
-            self._recorder.step(actions)  # while the jail is at it
+            self._recorder.step(actions)  # after sending: the jail computes meanwhile
         except WorkerDiedError:
             self.refuse_if_closed()  # a close() in another thread ended it
             raise
@@ -482,7 +484,7 @@ class Requests(RequestOrder):
         self.lifecycle.moved(Event.SUBMIT)
 
     def collect_step(self, timeout: float | Deadline | None) -> StepResult:
-        """What ``VectorEnv.step`` returns, with the lock held; raises as ``collect`` does."""
+        """Wait for a step's results, as ``VectorEnv.step`` returns them; raises as ``collect``."""
         try:
             deadline: Deadline = self._step_deadline
             if timeout is deadline.timeout_s:
@@ -506,12 +508,12 @@ class Requests(RequestOrder):
             self.after_request()
         if self._unshown:
             self.show_warnings()
-        if self._counters.steps == ENOUGH_STEPS:  # it may never be closed
+        if self._counters.steps == ENOUGH_STEPS:  # not only in close(), which may never be called
             self._lease.note_steps()
         return result
 
     def _mended(self, error: BaseException, deadline: Deadline) -> StepResult:
-        """The results of a step whose infos do not fit together, or whose runners died."""
+        """The results of a step whose infos cannot be joined, or whose runners died."""
         if isinstance(error, batches.Misfit):
             return self._lane().result(self._infos_apart(deadline))
         if not isinstance(error, RunnersDiedError):
@@ -526,7 +528,7 @@ class Requests(RequestOrder):
             return self.results.step(done, self._recovery.mark(infos))
 
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
-        """Fetch the last infos again, one by one, since those of shards do not fit together."""
+        """Fetch each sub-environment's last infos, since the shards' joined infos do not match."""
         own = self.own_infos(deadline)
         try:
             return self.results.joined_own(own)
@@ -535,9 +537,9 @@ class Requests(RequestOrder):
             raise
 
     def own_infos(self, deadline: Deadline, *, failed: bool = False) -> list[m.Value]:
-        """Fetch the last infos of each sub-environment as it gave them, by shards.
+        """Fetch the last infos of each sub-environment as it returned them; one reply a shard.
 
-        ``failed`` tells the runners instead that these could not be joined.
+        ``failed`` tells the runners instead that these infos could not be joined.
         """
         lane = self._lane()
         with self._outgoing("step"):
@@ -545,12 +547,12 @@ class Requests(RequestOrder):
         try:
             replies = self._finish(lane.replies, deadline)
         except RunnersDiedError as deaths:
-            self.lifecycle.answered()  # the next request meets the deaths
+            self.lifecycle.answered()  # the next request handles the deaths
             raise deaths.first from None
         return all_replies(replies, m.Value)
 
     def checked_own_infos(self, deadline: Deadline, *, failed: bool = False) -> list[m.Value]:
-        """``own_infos`` of one worker of several, which is given up if it sends infos of others."""
+        """``own_infos`` of one worker of several; gives up a worker that sends malformed infos."""
         with self.use.judging("a request"):
             replies = self.own_infos(deadline, failed=failed)
             self.results.own_pairs(replies)
@@ -560,12 +562,12 @@ class Requests(RequestOrder):
 
     @contextmanager
     def _sending(self, operation: str) -> Iterator[None]:
-        """Prepare and send a request: an error caused by a ``close`` in another thread says so."""
+        """Prepare and send a request; an error caused by a ``close`` in another thread says so."""
         try:
             try:
                 yield
             except BaseException:
-                with self.use.hold(operation):  # on failure only: it costs some us
+                with self.use.hold(operation):  # only on failure, as it costs microseconds
                     raise
             if self.lifecycle.state is State.CLOSED:
                 self._lease.let_go()
@@ -575,10 +577,10 @@ class Requests(RequestOrder):
 
     @contextmanager
     def _outgoing(self, operation: str, *, submit: bool = True) -> Iterator[None]:
-        """Send a message; ``submit`` unless another request is pending."""
+        """Move to PENDING and send a message; ``submit``: whether no other request is pending."""
         if submit:
             self.lifecycle.request = operation
-            self.lifecycle.on(Event.SUBMIT)  # interruption.md, rule 1: first
+            self.lifecycle.on(Event.SUBMIT)  # interruption.md, rule 1: before anything is sent
         try:
             yield
         except EnvHubError as error:
@@ -589,28 +591,28 @@ class Requests(RequestOrder):
 
     @contextmanager
     def _incoming(self) -> Iterator[None]:
-        """Handle replies: a worker that breaks a rule in them is given up."""
+        """Handle replies; a worker that violates the protocol in them is given up."""
         try:
             yield
         except BaseException:
-            with self.use.judging("a request"):  # on failure only: it costs some us
+            with self.use.judging("a request"):  # only on failure, as it costs microseconds
                 raise
         if self.lifecycle.state is State.CLOSED:
             self._lease.let_go()
 
     def _make_ready(self, operation: str) -> None:
         state, restart = self.lifecycle.state, self._repository.policy.restart
-        # a request that is still pending here was interrupted before its wait began
+        # this thread holds the lock, so a request that is still pending was interrupted
         pending = state is State.PENDING
         interrupted = self.lifecycle.request if pending else self._failures.interruption
         refused = refusal(state, operation, restart, interrupted)
         if refused is not None:
             raise refused
-        self._prewarm.note_use()  # already: the next one starts beside this
+        self._prewarm.note_use()  # first, so that the next task starts in parallel
         self._prewarm.start_on_demand()
 
     def _nothing_was_sent(self, error: BaseException) -> None:
-        """Restore the state if nothing was sent: interruption.md, rule 2."""
+        """Move back from PENDING if the error says that nothing was sent (rule 2)."""
         if isinstance(error, EnvHubError) and self.lifecycle.state is State.PENDING:
             self.lifecycle.answered()
 
@@ -624,7 +626,7 @@ class Requests(RequestOrder):
         return WorkerError(f"there is no request to wait for: the environment is {state}")
 
     def _finish(self, receive: Callable[[Deadline], T], deadline: Deadline) -> T:
-        """Wait for the pending reply, and move to the state that follows."""
+        """Wait for the pending reply by ``receive``, and move to the next state; returns it."""
         try:
             received = receive(deadline)
         except RunnersDiedError:
@@ -640,7 +642,7 @@ class Requests(RequestOrder):
         return received
 
     def _failed(self, error: EnvHubError, deadline: Deadline) -> NoReturn:
-        """Raise the error that ended a wait, and move to the state that follows."""
+        """Move to the state that follows from the error that ended a wait, and raise an error."""
         failures, operation = self._failures, self.lifecycle.request or "a request"
         if isinstance(error, WorkerDiedError) and error.reason == "connection":
             self._lease.note_lost()

@@ -1,4 +1,4 @@
-"""One thread uses an environment at a time; the next one waits. ``close`` never waits for it.
+"""The lock that lets one thread at a time use an environment. ``close`` never waits for it.
 
 A thread holds the lock from before a request is sent until its replies are handled:
 docs/internals/interruption.md, rules 10 to 12.
@@ -17,15 +17,15 @@ from envhub_worker.protocol.errors import blamed, is_fault
 from envhub_worker.protocol.lifecycle import State
 
 _AT_ONCE = 8
-"""How many locks one ``with`` takes."""
+"""The number of locks that one ``with`` takes."""
 
 
 @contextmanager
 def all_held(locks: Sequence[threading.RLock]) -> Iterator[None]:
     """Hold several locks, taken in their order.
 
-    A ``with`` statement takes and notes a lock without room for a Ctrl-C, so all are taken by such
-    statements, eight at a time; a tree of these keeps the nesting low.
+    A ``with`` statement takes and notes a lock without room for a Ctrl-C in between. So ``with``
+    statements take all locks, eight at a time, in a tree that keeps the nesting low.
     """
     if len(locks) > _AT_ONCE:
         middle = len(locks) // 2
@@ -39,13 +39,13 @@ def all_held(locks: Sequence[threading.RLock]) -> Iterator[None]:
 
 
 class UseLock:
-    """The lock of one environment, and what is to be done when it is released.
+    """The lock of one environment; its holder completes a ``close`` that came meanwhile.
 
     Attributes:
-        lock: Held for as long as a use lasts; reentrant, for a signal handler may close what its
-            own thread waits for.
-        flight: Held in ``send``, ``recv`` and ``reset``, taken before ``lock``: a ``recv`` holds
-            only the locks of workers that owe something.
+        lock: Held during a use. Reentrant, since a signal handler may close the environment that
+            its own thread is using.
+        flight: Held in ``send``, ``recv`` and ``reset``, and taken before ``lock``, since a
+            ``recv`` holds only the locks of workers that owe answers.
     """
 
     def __init__(self, lease: Lease, failures: Failures) -> None:
@@ -56,7 +56,7 @@ class UseLock:
 
     @contextmanager
     def hold(self, operation: str) -> Iterator[None]:
-        """Hold the lock. A ``close`` that came meanwhile did not wait: finish it here."""
+        """Hold the lock. If ``close`` was called meanwhile, which does not wait, complete it."""
         with self.lock, self._lease.repository.named():
             try:
                 yield
@@ -67,8 +67,8 @@ class UseLock:
                 self._lease.let_go()
 
     def _after_close(self, operation: str, error: BaseException) -> None:
-        """After a ``close`` in the meantime, give back what is left.
-        Raises ``WorkerDiedError``: it was closed, and the error does not say so.
+        """If ``close`` was called meanwhile, give back jail and server.
+        Raises ``WorkerDiedError``: the environment was closed, and the error does not say so.
         """
         if not self._lease.lifecycle.closed:
             return
@@ -78,14 +78,14 @@ class UseLock:
 
     @contextmanager
     def judging(self, operation: str) -> Iterator[None]:
-        """Hold the lock to handle replies.
-        Raises ``RemoteProtocolError``: the worker broke a rule in them; the environment is DEAD.
+        """Hold the lock while replies are handled.
+        Raises ``RemoteProtocolError``: a reply violates the protocol; the environment is DEAD.
         """
         with self.hold(operation):
             try:
                 yield
             except Exception as error:
-                # in any other state the error has been dealt with already, or ended a wait
+                # in any other state the error was handled already, or ended a wait
                 if self._lease.lifecycle.state is State.READY:
                     self._judge(error)
                 raise
@@ -99,13 +99,13 @@ class UseLock:
             self._failures.dead(error)
 
     def abandon(self) -> None:
-        """In a fork, the thread that held the lock does not exist: interruption.md, rule 14."""
+        """In a fork, replace the locks, whose holder does not exist: interruption.md, rule 14."""
         self.lock = threading.RLock()
         self.flight = threading.RLock()
 
 
 class FleetUse:
-    """The use of all parts at a time, by one thread: see ``UseLock``."""
+    """The lock of an environment over several workers: the locks of all parts."""
 
     def __init__(self, parts: Sequence[UseLock]) -> None:
         self._parts = parts
@@ -121,17 +121,17 @@ class FleetUse:
 
     @property
     def flight(self) -> threading.RLock:
-        """See ``UseLock``: that of the first part, which a fork replaces."""
+        """The first part's ``flight``, which a fork replaces; see ``UseLock``."""
         return self._parts[0].flight
 
     @property
     def is_mine(self) -> bool:
-        """Whether this thread holds them."""
+        """Whether this thread holds the locks."""
         return self._holder == threading.get_ident()
 
     @contextmanager
     def hold(self, locks: Sequence[threading.RLock]) -> Iterator[None]:
-        """Hold these of the parts' locks."""
+        """Hold some of the parts' locks."""
         with all_held(locks):
             before, self._holder = self._holder, threading.get_ident()
             try:

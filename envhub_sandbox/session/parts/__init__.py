@@ -1,1 +1,1 @@
-"""One environment over several workers: a session for each, and what joins these into one."""
+"""One environment over several workers: joins a session for each worker into one."""

@@ -1,13 +1,13 @@
-"""One environment over several workers: the life of all its parts as that of one, and its requests.
+"""The life and the requests of one environment over several workers.
 
-A *part* is an ``EnvSession`` with some of the sub-environments, in a jail of its own, wherever its
-launcher opens that. Its restarts, counters and ends are its own. What a ``SandboxVectorEnv`` asks
-of an ``EnvSession`` is asked of all of them here.
+A *part* is an ``EnvSession`` with some of the sub-environments, in a jail of its own, which its
+launcher may open on any server. Each part has its own restarts, counters and end. The classes here
+have the interface of ``EnvSession`` for a ``SandboxVectorEnv``, and pass each request to all parts.
 
-A request goes to all parts before the first answer is waited for, and every part is waited for,
-also where another has failed: no part owes an answer afterwards. docs/internals/interruption.md
-holds for each part. A Ctrl-C in the midst of several leaves some of them ``READY`` and some
-``PENDING``: the next request is refused, and ``reset`` catches up.
+A request goes to all parts before the wait for the first answer. Every part is waited for, even if
+another part has failed, so no part owes an answer afterwards. docs/internals/interruption.md holds
+for each part. A Ctrl-C between parts leaves some of them ``READY`` and some ``PENDING``: the next
+request is refused, and ``reset`` takes the late answers.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ from envhub_worker.protocol.spaces import batches
 
 T = TypeVar("T")
 _ENDS_S = 10.0
-"""How long to wait for starts that were given up after an interrupt."""
+"""How long to wait for the end of starts that were given up after an interrupt."""
 _WORST = (
     *(State.CLOSED, State.FOREIGN, State.DEAD, State.EXPIRED, State.LATE, State.REVIVING),
     *(State.PENDING, State.IDLE, State.READY),
 )
-"""The state of several parts is the first of theirs in this order."""
+"""The order of states from worst to best; several parts are in the worst state of any part."""
 
 
 class FleetSession:
     """The life of one vector environment in several jails: see ``EnvSession``.
-    ``parts``: one for each worker, in the order of their sub-environments.
-    ``recorder``: of the whole environment; the parts were made with it.
+    ``parts``: one session for each worker, in the order of their sub-environments.
+    ``recorder``: records for the whole environment; the parts were made with it.
     """
 
     def __init__(self, parts: Sequence[EnvSession], recorder: Recorder) -> None:
@@ -79,7 +79,7 @@ class FleetSession:
 
     @property
     def jails(self) -> int:
-        """That it lives in at a time."""
+        """The number of jails that it uses at a time."""
         return len(self.parts)
 
     def report(self) -> list[dict[str, Any]]:
@@ -91,19 +91,19 @@ class FleetSession:
         ]
 
     def denials(self) -> tuple[str, ...] | None:
-        """What any of the jails was denied; None where that is not recorded."""
+        """The denials of all jails; None if they are not recorded."""
         recorded = [denials for part in self.parts if (denials := part.denials()) is not None]
         return tuple(dict.fromkeys(chain.from_iterable(recorded))) if recorded else None
 
     def usage(self) -> dict[str, int]:
-        """What all jails hold; empty if one does not say."""
+        """What all jails use together; empty if a server does not say."""
         figures = [part.usage() for part in self.parts]
         if not all(figures):
             return {}
         return {name: sum(figure[name] for figure in figures) for name in figures[0]}
 
     def stats(self) -> dict[str, Any]:
-        """Counters of the whole, and of each worker."""
+        """The counters of the whole environment, and of each worker."""
         workers = [
             {
                 "place": part.lease.place,
@@ -117,17 +117,17 @@ class FleetSession:
         return {**whole, "state": self.lifecycle.state.name, "workers": workers}
 
     def take_apart(self, deadline: Deadline) -> bool:
-        """See ``EnvSession``: of all parts, or of none."""
+        """Have infos come apart, in all parts or in none; returns whether they do."""
         results = self.requests.results
         if not results.apart and all(part.may_take_apart for part in self.parts):
             results.apart = all(part.take_apart(deadline) for part in self.parts)
         return results.apart
 
     def recover(self) -> None:
-        """Before a reset: see ``EnvSession``. All parts share the time that one has for that."""
+        """Recover every part before a reset, within the time that one session has for it."""
         grace = Deadline(GRACE_S)
         if any(part.lifecycle.state is State.DEAD for part in self.parts):
-            # what has ended one may have ended others, which have not been asked since
+            # the same cause may have ended other parts, which have had no request since
             for part in self.parts:
                 part.notice_death()
         for part in self.parts:
@@ -135,15 +135,15 @@ class FleetSession:
                 part.recover(grace)
 
     def close(self) -> None:
-        """Close every part, side by side: see ``EnvSession``."""
+        """Close all parts in parallel; see ``EnvSession.close``."""
         if not (self.requests.use.is_mine or self.lifecycle.closed):
-            with contextlib.suppress(RuntimeError):  # this system has no thread left
+            with contextlib.suppress(RuntimeError):  # no further thread can be started
                 Calls([part.close for part in self.parts]).wait()
         self.finalize()
 
     def finalize(self) -> None:
-        """Close every part in turn. A finalizer starts no thread: the garbage collector may have
-        called it while one is being started."""
+        """Close every part in turn. A finalizer must start no thread, since the garbage collector
+        may call it while a thread is being started."""
         with contextlib.ExitStack() as stack:  # interruption.md, rule 9
             for part in self.parts[::-1]:
                 stack.callback(part.close)
@@ -153,33 +153,33 @@ AnySession = EnvSession | FleetSession
 
 
 class FleetLifecycle:
-    """The state of several parts as that of one: see ``Lifecycle``."""
+    """Combines the states of several parts into one: see ``Lifecycle``."""
 
     def __init__(self, parts: Sequence[EnvSession]) -> None:
         self._parts = [part.lifecycle for part in parts]
 
     @property
     def state(self) -> State:
-        """That of the part that is worst off."""
+        """The worst state of any part."""
         return min((part.state for part in self._parts), key=_WORST.index)
 
     @property
     def closed(self) -> bool:
-        """Whether all are closed."""
+        """Whether all parts are closed."""
         return all(part.closed for part in self._parts)
 
 
-# --- its requests
+# --- requests to all parts
 
 
 class FleetRequests(RequestOrder):
-    """The requests of all parts as those of one environment: see ``Requests``.
+    """Sends the requests of one environment to all of its parts: see ``Requests``.
 
     Args:
-        parts: One for each worker, in the order of their sub-environments.
-        results: Joins what the parts give; its bounds are theirs.
-        recorder: That of the whole environment.
-        counters: Likewise.
+        parts: One session for each worker, in the order of their sub-environments.
+        results: Joins the parts' results; its bounds are the parts' slices.
+        recorder: Records for the whole environment.
+        counters: The counters of the whole environment.
     """
 
     use: FleetUse
@@ -207,7 +207,7 @@ class FleetRequests(RequestOrder):
 
     @property
     def closed(self) -> bool:
-        """Whether the caller has called ``close``; each part knows it, for its own errors."""
+        """Whether the caller has called ``close``; each part keeps it, for its own errors."""
         return self._each[0].closed
 
     @closed.setter
@@ -216,13 +216,13 @@ class FleetRequests(RequestOrder):
             requests.closed = closed
 
     def note_sent(self, actions: Any | None) -> None:
-        """See ``RequestOrder``."""
+        """Count and record a step that was sent; see ``RequestOrder``."""
         self._counters.requests += 1
         if actions is not None:
             self._recorder.step(actions)
 
     def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
-        """Ask the part that has the sub-environment; the others are not asked."""
+        """Ask only the part that has the sub-environment."""
         with self.use.lock:
             self.refuse_if_busy(f"envs[{index}].{name}")
             if self.before_request is not None:
@@ -239,7 +239,7 @@ class FleetRequests(RequestOrder):
     def submit(
         self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
     ) -> None:
-        """See ``Requests.submit``. Nothing is sent unless all parts are ready and all is packed."""
+        """Send a request to all parts; nothing is sent unless all are ready and all is packed."""
         if self.before_request is not None:
             self.before_request()
         self._make_ready(operation)
@@ -260,7 +260,7 @@ class FleetRequests(RequestOrder):
     def collect(
         self, timeout: float | Deadline | None, kind: type[m.M] | tuple[type[m.M], ...]
     ) -> list[m.M]:
-        """See ``Requests.collect``: the replies of all parts, in order."""
+        """Wait for the replies of all parts, in order; see ``Requests.collect``."""
         deadline = deadline_of(timeout)
 
         def take(at: int) -> list[m.M]:
@@ -273,7 +273,7 @@ class FleetRequests(RequestOrder):
     def one_each(
         self, operation: str, replies: list[m.Value] | list[m.WatchDone]
     ) -> tuple[Any, ...]:
-        """One value for each sub-environment; a part whose reply is none of these is given up."""
+        """One value for each sub-environment; a part that sent another number is given up."""
 
         def take(at: int) -> tuple[Any, ...]:
             own: list[Any] = [replies[at]]
@@ -284,7 +284,7 @@ class FleetRequests(RequestOrder):
     def finish_reset(
         self, replies: list[m.ResetDone], timeout: float | Deadline | None
     ) -> tuple[Any, dict[Any, Any]]:
-        """See ``Requests.finish_reset``."""
+        """Turn the parts' replies into one result of ``VectorEnv.reset``; raises as ``collect``."""
 
         def take(at: int) -> tuple[Any, dict[Any, Any]]:
             return self._each[at].finish_reset([replies[at]], timeout)
@@ -300,7 +300,7 @@ class FleetRequests(RequestOrder):
     # --- steps ---------------------------------------------------------------------------------
 
     def submit_step(self, actions: Any) -> None:
-        """See ``Requests.submit_step``: to each part its rows."""
+        """Send each part its rows of the actions; see ``Requests.submit_step``."""
         if self.before_request is not None:
             self.before_request()
         for part in self._parts:
@@ -320,8 +320,8 @@ class FleetRequests(RequestOrder):
         self._recorder.step(actions)
 
     def _packed(self, actions: Any, rows: Sequence[Any]) -> Sequence[Request | None]:
-        """Each worker's encoded step; nothing is sent unless all can be.
-        Raises ``LocalProtocolError``, with the position in all of the ``actions``.
+        """Encode each worker's step before any is sent, since one may be impossible to send.
+        Raises ``LocalProtocolError``, with the position in the whole batch of ``actions``.
         """
         try:
             pairs = zip(self._each, rows, strict=True)
@@ -332,13 +332,14 @@ class FleetRequests(RequestOrder):
             raise
 
     def collect_step(self, timeout: float | Deadline | None) -> StepResult:
-        """See ``Requests.collect_step``."""
+        """Wait for all parts' results of the step, and join them; see ``Requests.collect_step``."""
         deadline: Deadline = self._step_deadline
         if timeout is deadline.timeout_s:
             self._step_deadline.running = False
         else:
             deadline = deadline_of(timeout)
-        # in turns, so that each worker is waited for as often before the others as after them
+        # Each step begins its wait at another worker, so that the waiting times of the workers can
+        # be compared.
         self._first = (self._first + 1) % len(self._each)
         parts = self._of_all(partial(self._collect_step, deadline), self._first)
         self._counters.stepped(perf_counter_ns() - self._sent_ns)
@@ -357,7 +358,7 @@ class FleetRequests(RequestOrder):
             self._counters.waited(at, perf_counter_ns() - begun_ns)
 
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
-        """Fetch the last infos of all parts again, one by one, since they do not fit together."""
+        """Fetch each sub-environment's last infos, since the parts' joined infos do not match."""
         failed = False
 
         def take(at: int) -> list[m.Value]:
@@ -390,11 +391,11 @@ class FleetRequests(RequestOrder):
                     self._each[at].make_ready(operation, start)
 
     def _start(self, parts: Sequence[EnvSession]) -> list[Callable[[], None]]:
-        """Start parts side by side while this thread holds their locks; returns functions that
-        raise why a part could not be started.
+        """Start parts in parallel while this thread holds their locks. Returns a function for each
+        part that raises the error of its start, if it failed.
         """
         self._wait_for_starts()
-        parts[0].prewarm.note_use()  # already: the next task starts beside this
+        parts[0].prewarm.note_use()  # first, so that the next task starts in parallel
         startup_s = self._timeouts.startup_s
         deadlines = [StartupDeadline(startup_s) for _ in parts]
         pairs = zip(parts, deadlines, strict=True)
@@ -414,7 +415,10 @@ class FleetRequests(RequestOrder):
             raise WorkerTimeoutError("processes are still being started; call reset() again")
 
     def _send(self, send: Callable[[int], None]) -> None:
-        """Send to each part. A failure after others were sent theirs is kept for ``_of_all``."""
+        """Send to each part; keep the failures of all but the first part for ``_of_all``."""
+        # If the first part fails, nothing was sent and the error is raised at once. Later, other
+        # parts owe answers: the failed part moves to LATE, and ``_of_all`` raises its error after
+        # it has taken the answers of the others (interruption.md, rule 17).
         self._unsent = {}
         for at in range(len(self._parts)):
             try:
@@ -427,7 +431,7 @@ class FleetRequests(RequestOrder):
                 self._each[at].fall_behind()
 
     def _of_all(self, take: Callable[[int], T], first: int = 0) -> list[T]:
-        """Call for every part, then raise the first failure: interruption.md, rule 17."""
+        """Call ``take`` for every part, then raise the first failure: interruption.md, rule 17."""
         failures, self._unsent = self._unsent, {}
         taken: dict[int, T] = {}
         count = len(self._parts)
@@ -442,7 +446,7 @@ class FleetRequests(RequestOrder):
         return [taken[at] for at in range(count)]
 
     def _fail(self, failures: dict[int, Exception]) -> None:
-        # a death or a late reply first, as where the workers are processes of one jail
+        # a death or a late reply comes first, as it does with several processes in one jail
         fatal = [at for at, error in failures.items() if isinstance(error, WorkerError)]
         first = min(fatal or failures)
         error = failures.pop(first)
@@ -460,7 +464,7 @@ def _step(actions: Any, number: int, bounds: tuple[int, int]) -> m.Message:
 
 
 def _joined(requests: Sequence[Request], bounds: Sequence[tuple[int, int]]) -> Request:
-    """The parts' requests as one, to be recorded."""
+    """Join the parts' requests into one, for the recorder."""
     return Request(
         requests[0].operation,
         [message for request in requests for message in request.messages],

@@ -1,8 +1,8 @@
-"""What was sent to the workers of an environment, and not received: ``send`` and ``recv``.
+"""``send`` and ``recv``: requests in flight, which were sent to workers and not received yet.
 
 A worker steps its sub-environments together, so they are ready together. Its answers are taken in
-the order of its requests, so results depend on actions and seeds alone; time decides only in which
-batch they come.
+the order of its requests, so results depend only on actions and seeds. Speed determines only which
+batch they are in.
 
 Followed: EnvPool's ``send`` and ``recv``, and PufferLib's, for the ids beside the results.
 """
@@ -43,8 +43,8 @@ class Received(NamedTuple):
         observations: ``(n, *single_observation_space.shape)``.
         rewards: float64 ``(n,)``; 0 after a reset.
         terminations, truncations: bool ``(n,)``; False after a reset.
-        infos: As in ``step``, with ``n`` rows. If workers return different dtypes or shapes for an
-            entry, it is an object array that keeps each of them.
+        infos: As in ``step``, with ``n`` rows. If workers return different dtypes or shapes for a
+            key, its value is an object array.
         env_ids: int64 ``(n,)``, ascending.
     """
 
@@ -57,12 +57,12 @@ class Received(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Which sub-environments something is for.
+    """A choice of sub-environments.
 
     Attributes:
-        named: Their ids, as they were named.
-        workers: The places of their workers, all of whose sub-environments they are.
-        order: Where each of them was named, by ascending ids; None if in that order.
+        named: The ids, in the caller's order.
+        workers: The indices of the workers that have exactly these sub-environments.
+        order: The positions in ``named``, by ascending id; None if ``named`` is ascending.
     """
 
     named: list[int]
@@ -71,11 +71,11 @@ class Rows(NamedTuple):
 
 
 class InFlight:
-    """The requests that were sent and not received, of all workers of an environment.
+    """The requests in flight to all workers of an environment.
 
-    Used by one thread at a time. A ``close`` may come from another: a wait holds the locks of the
-    workers that it waits for, so it is ended as any request is (interruption.md, rule 11).
-    ``order``: the environment's requests.
+    One thread at a time uses it. Another thread may call ``close``: a wait holds the locks of the
+    workers that it waits for, so ``close`` ends it like any request (interruption.md, rule 11).
+    ``order``: the requests of the environment.
     ``parts``: the session of each worker, in the order of their sub-environments.
     """
 
@@ -92,9 +92,9 @@ class InFlight:
     # --- sending ---------------------------------------------------------------------------------
 
     def rows(self, env_ids: Any) -> Rows:
-        """The rows with these ids; all for None.
-        Raises ``ActionError``: there is no such sub-environment, one is named twice, or one is
-        missing that shares a worker with these.
+        """The rows with these ids; all rows for None.
+        Raises ``ActionError``: an id does not exist or occurs twice, or the ids lack a
+        sub-environment that shares a worker with them.
         """
         count = len(self._worker_of)
         if env_ids is None:
@@ -129,15 +129,15 @@ class InFlight:
         return workers
 
     def send(self, rows: Rows, actions: Any) -> None:
-        """Send each worker its slice of a validated batch, whose order is that of the ids.
+        """Send each worker its slice of a validated batch, which is in the order of the ids.
 
-        Raises as ``Requests.submit_step`` does, if nothing was sent. A later failure is raised by
-        ``recv``.
+        Raises as ``Requests.submit_step`` does, if nothing was sent; ``recv`` raises later
+        failures.
         """
         if rows.order is not None:
             actions = batches.reordered(self._actions, actions, rows.order)
         if not isinstance(actions, np.ndarray) or actions.nbytes >= LARGE_BYTES:
-            actions = copy.deepcopy(actions)  # what is large is sent later, from where it lies
+            actions = copy.deepcopy(actions)  # large arrays are sent later and may change
         queues = self._of(rows)
         slices = list(pairwise(accumulate((queue.count for queue in queues), initial=0)))
         parts = [actions] if len(slices) == 1 else batches.split(self._actions, actions, slices)
@@ -164,7 +164,11 @@ class InFlight:
     def _sending(
         self, name: str, queues: Sequence[WorkerQueue], prepare: Callable[[WorkerQueue], None]
     ) -> Iterator[None]:
-        """Before anything is sent, all must be able to take it."""
+        """Prepare all workers before anything is sent; note what is in flight around the send."""
+        # Every check and every ``prepare`` comes before the first message, so that a refusal has
+        # sent nothing. ``waiting`` and ``_sends`` are set before the first message and cleared
+        # after the last (interruption.md, rule 1): after an interrupt in between they are still
+        # set, and all requests but ``reset`` are refused.
         with self._held(queues):
             if self._order.waiting != SENT:
                 self._order.refuse_if_busy(name)
@@ -172,18 +176,18 @@ class InFlight:
             self._refuse_if_interrupted(name)
             for queue in queues:
                 prepare(queue)
-            self._order.waiting, self._sends = SENT, True  # interruption.md, rule 1
+            self._order.waiting, self._sends = SENT, True
             yield
             self._sends = False
             self._note()
 
     def _held(self, queues: Sequence[WorkerQueue]) -> AbstractContextManager[None]:
-        """The locks of these workers: interruption.md, rule 10."""
+        """Hold the locks of these workers: interruption.md, rule 10."""
         locks, use = [queue.part.use.lock for queue in queues], self._order.use
         return use.hold(locks) if isinstance(use, FleetUse) else all_held(locks)
 
     def _refuse_if_interrupted(self, name: str) -> None:
-        """After an interrupt it is not known who was sent something, or whose results are lost."""
+        """Raise after an interrupt: it is unknown what was sent, and which results are lost."""
         if self._sends or any(queue.interrupted for queue in self._queues):
             restart = self._queues[0].part.repository.policy.restart
             refused = refusal(State.PENDING, name, restart, "send or recv")
@@ -191,7 +195,7 @@ class InFlight:
             raise refused
 
     def _note(self) -> None:
-        """Refuse other requests as long as something is in flight."""
+        """Note whether something is in flight, so that other requests are refused."""
         self._order.waiting = SENT if self._is_pending() else None
 
     def _is_pending(self) -> bool:
@@ -200,14 +204,13 @@ class InFlight:
     # --- receiving -------------------------------------------------------------------------------
 
     def recv(self, min_ready: int, timeout: float | Deadline | None) -> Received:
-        """The results of the first sub-environments that are ready, of each at most one.
-        Raises ``NoAsyncCallError``: nothing was sent; ``WorkerTimeoutError``: ``timeout`` came
-        first, and nothing is lost; or a worker's own timeout did, as ``Requests.collect_step``
-        says.
+        """The results of the first sub-environments that are ready, at most one for each.
+        Raises ``NoAsyncCallError``: nothing was sent; ``WorkerTimeoutError``: ``timeout`` passed,
+        and nothing is lost, or a step took too long, as in ``Requests.collect_step``.
         """
         self._order.refuse_if_closed()
         if not self._is_pending():
-            if self._order.waiting == SENT:  # an interrupt came before this was noted
+            if self._order.waiting == SENT:  # an interrupt came before ``_note``
                 self._note()
             raise NoAsyncCallError("Calling `recv` without any prior call to `send`.", "recv")
         self._refuse_if_interrupted("recv")
@@ -220,13 +223,13 @@ class InFlight:
                         self._take(worker)
                 return self._joined(taken)
             except Exception:
-                self._order.refuse_if_closed()  # as by a signal handler
+                self._order.refuse_if_closed()  # a signal handler may have closed it
                 raise
             finally:
                 self._note()
 
     def _refuse_fewer_than_come(self, min_ready: int) -> None:
-        """Raises ``ValueError``: where one worker has all, they are ready together."""
+        """Raise ``ValueError`` if one worker has all sub-environments: all are ready together."""
         [queue, *others] = self._queues
         if others or min_ready >= queue.count:
             return
@@ -240,7 +243,7 @@ class InFlight:
         raise ValueError(f"`min_ready` is {min_ready}, but {whole}: {cure}. Nothing is lost")
 
     def _wait(self, deadline: Deadline) -> list[int]:
-        """Sleep until workers have answered, or are late; which. Raises ``WorkerTimeoutError``."""
+        """Sleep until workers have answered or are late; returns these. Raises at ``deadline``."""
         busy = [worker for worker, queue in enumerate(self._queues) if queue.busy]
         lanes = [self._queues[worker].lane for worker in busy]
         ended = [worker for worker, lane in zip(busy, lanes, strict=True) if lane is None]
@@ -255,7 +258,7 @@ class InFlight:
         return [busy[at] for at in answered or late]
 
     def _take(self, worker: int) -> None:
-        """Take a worker's oldest answer. An error waits for the worker's results before it."""
+        """Take a worker's oldest answer. An error is kept until earlier results were received."""
         try:
             self._queues[worker].take(partial(self._keep, worker))
         except (EnvHubError, RemoteEnvWarning) as error:
@@ -267,8 +270,8 @@ class InFlight:
         self._ready.append((worker, result))
 
     def _first(self, min_ready: int) -> dict[int, StepResult] | None:
-        """The oldest result of each worker, until there are ``min_ready`` rows or no more to come;
-        None if there will be more. Raises the error whose turn it is.
+        """The oldest result of each worker, until there are ``min_ready`` rows or none is owed;
+        None if fewer are there and more are owed. Raises an error if it is a worker's oldest.
         """
         self._order.refuse_if_closed()
         oldest: dict[int, StepResult] = {}
@@ -291,7 +294,7 @@ class InFlight:
         return None if owing else taken
 
     def _joined(self, taken: dict[int, StepResult]) -> Received:
-        """Join results into one batch, by ids, and remove them."""
+        """Join results into one batch, by ascending ids, and remove them from the ready ones."""
         places = sorted(taken)
         queues = [self._queues[worker] for worker in places]
         env_ids = np.concatenate([np.arange(*queue.rows) for queue in queues])
@@ -313,7 +316,7 @@ class InFlight:
         return received
 
     def drop(self) -> None:
-        """Wait for what is owed, and forget it with all that was not received."""
+        """Wait for the answers that are owed, and drop all results that were not received."""
         with self._held(self._queues):
             try:
                 for queue in self._queues:
@@ -325,9 +328,9 @@ class InFlight:
 
 
 def _queues_of(parts: Sequence[EnvSession]) -> list[WorkerQueue]:
-    """One for each worker, in the order of their sub-environments."""
+    """A queue for each worker, in the order of their sub-environments."""
     [part, *others] = parts
-    # a runner that comes back in the same jail repeats the last request of all
+    # a restarted runner repeats the last request to all shards, so these share one queue
     if others or len(part.bounds) == 1 or part.repository.policy.restart == "transparent":
         return [WorkerQueue(part, part.rows, sliced=bool(others)) for part in parts]
     shards: list[ShardQueue] = []

@@ -1,8 +1,8 @@
-"""``send`` and ``recv`` where several workers live in one jail: the queue of each of them.
+"""``send`` and ``recv`` to several workers in one jail: a queue for each worker.
 
-Each worker gets messages of its own, whatever lane steps of all workers take; a request's number
-tells its answer from others. The session has one state for all workers, ``PENDING`` as long as any
-owes an answer; if it ends, it ends for all.
+Each worker gets messages of its own, whatever lane the steps of all workers use; the request's
+number identifies its answer. The session has one state for all workers: it is ``PENDING`` while any
+worker owes an answer, and if the session ends, it ends for all.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from envhub_worker.protocol.lifecycle import State
 
 
 class ShardQueue(WorkerQueue):
-    """What one worker of a jail owes: see ``WorkerQueue``.
+    """The queue of one worker of a jail: see ``WorkerQueue``.
 
     Args:
-        part: The session of all of them.
-        shard: Which worker it is.
-        others: The queues of all, which this one is appended to.
+        part: The session of all workers in the jail.
+        shard: The index of this worker.
+        others: The queues of all workers; this queue is appended to it.
     """
 
     def __init__(self, part: EnvSession, shard: int, others: list[ShardQueue]) -> None:
@@ -39,14 +39,14 @@ class ShardQueue(WorkerQueue):
 
     @property
     def lane(self) -> Lane | None:
-        """See ``WorkerQueue``."""
+        """The lane to wait on; None if nothing is owed."""
         return self._way if self._owed else None
 
     def _results(self) -> Results:
         return self._shard_lane().declared
 
     def _shard_lane(self) -> Lane:
-        """The way to this worker alone, in the jail that there is."""
+        """The lane to this worker alone, in the present jail."""
         whole = self.part.lease.lane
         assert whole is not None
         if self._way is None or self._whole is not whole:
@@ -56,16 +56,16 @@ class ShardQueue(WorkerQueue):
     # --- sending ---------------------------------------------------------------------------------
 
     def _is_ready(self, operation: str) -> bool:
-        """Also while other shards of the jail have not answered."""
+        """Whether a request can be sent at once; other shards may still owe answers."""
         state = self.part.lifecycle.state
         return state is State.READY or (state is State.PENDING and bool(_owing(self._others)))
 
     def step(self, actions: Any) -> None:
-        """See ``WorkerQueue``."""
+        """Implements ``WorkerQueue.step``."""
         self._submit("step", m.Step(self._shard_lane().number, actions))
 
     def reset(self, message_for: MessageFor) -> None:
-        """See ``WorkerQueue``."""
+        """Implements ``WorkerQueue.reset``."""
         self._submit("reset", message_for(self._shard_lane().number, self.rows))
 
     def _submit(self, operation: str, message: m.Message) -> None:
@@ -84,7 +84,7 @@ class ShardQueue(WorkerQueue):
         try:
             return lane.declared.step(replies) if is_step else lane.declared.reset(replies)
         except EnvHubError:
-            with self._requests.use.judging("recv"):  # on failure only: it costs some us
+            with self._requests.use.judging("recv"):  # only on failure, as it costs microseconds
                 raise
 
     def _go_on(self) -> None:
@@ -103,7 +103,7 @@ class ShardQueue(WorkerQueue):
         self.taking = False
 
     def forget(self) -> None:
-        """See ``WorkerQueue``. A reset waits for what the worker owes still."""
+        """Expect nothing more; a later reset waits for the answers that this worker still owes."""
         if self._owed and self._way is not None and self._whole is not None:
             self._whole.owe_for(self._way)
         self._way = None

@@ -1,7 +1,7 @@
-"""The requests of one worker that ``send`` has made, in their order, and their answers.
+"""The queue of one worker: its requests from ``send``, in order, and their answers.
 
-docs/internals/interruption.md holds for the worker's session. ``taking`` is what its rule 1 asks
-for here: set before an answer is taken, and cleared once it is kept and the next request noted.
+docs/internals/interruption.md holds for the worker's session. By its rule 1, ``taking`` is set
+before an answer is taken, and cleared after the answer is kept and the next request is noted.
 """
 
 from __future__ import annotations
@@ -29,22 +29,21 @@ from envhub_worker.protocol.spaces import batches
 
 
 class WorkerQueue:
-    """What one worker owes, and what it is to be sent after that.
+    """The requests that one worker has to answer, and steps that wait to be sent to it.
 
-    A worker is sent a further step before it has answered the last one where its lane can carry
-    that, which hides the way there and back. Elsewhere the step waits here.
+    If the worker's lane can carry several steps, the next step is sent before the last one is
+    answered, which hides the latency of the network. Otherwise the step waits here.
 
     Args:
-        part: Its session.
+        part: The worker's session.
         rows: The first of its sub-environments, and the one after the last.
-        sliced: Whether there are other workers, with whose infos its own are joined.
+        sliced: Whether there are other workers, whose infos have to be joined with this one's.
 
     Attributes:
-        part: Its session.
-        rows: The first of its sub-environments, and the one after the last.
-        count: How many they are.
-        failure: The error of sending a step that had waited here.
-        taking: Whether an answer is being taken; True afterwards only after an interrupt.
+        part, rows: As given.
+        count: The number of its sub-environments.
+        failure: The error of sending a step, which ``take`` raises.
+        taking: Whether an answer is being taken; stays True after an interrupt.
     """
 
     def __init__(self, part: EnvSession, rows: tuple[int, int], *, sliced: bool) -> None:
@@ -55,7 +54,7 @@ class WorkerQueue:
         self._requests = part.requests
         self._timeouts = part.repository.timeouts
         self._sliced = sliced
-        self._lost = tuple(range(*rows))  # what nothing more comes of, after an error
+        self._lost = tuple(range(*rows))  # the rows that get no more results after an error
         self._owed: deque[str] = deque()
         self._waiting: deque[Any] = deque()
         self._deadline = Deadline(None)
@@ -63,12 +62,12 @@ class WorkerQueue:
 
     @property
     def busy(self) -> bool:
-        """Whether an answer is to come, or a failure is to be raised."""
+        """Whether an answer is owed, or a failure has to be raised."""
         return bool(self._owed or self._waiting) or self.taking or self.failure is not None
 
     @property
     def interrupted(self) -> bool:
-        """Whether an interrupt came into an answer, or into a message to the worker."""
+        """Whether an interrupt came while an answer was taken or a message was sent."""
         lane = self.part.lease.lane
         return self.taking or (lane is not None and lane.jail.client.torn)
 
@@ -79,14 +78,14 @@ class WorkerQueue:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds that its oldest request may still take; None for any number."""
+        """The seconds left for its oldest request; None for no limit."""
         return self._deadline.left_s()
 
     # --- sending ---------------------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """With the lock held, prepare for ``step``; raises as ``Requests.submit`` does.
-        Raises ``AlreadyPendingCallError``: the worker owes as many answers as it may.
+        """Prepare for ``step``, with the lock held; raises as ``Requests.submit`` does.
+        Raises ``AlreadyPendingCallError``: the worker already owes ``MAX_IN_FLIGHT`` answers.
         """
         if len(self._owed) + len(self._waiting) >= MAX_IN_FLIGHT:
             raise AlreadyPendingCallError(
@@ -98,7 +97,7 @@ class WorkerQueue:
             self._make_ready("step")
 
     def prepare_reset(self) -> None:
-        """With the lock held, prepare for ``reset``: restart a worker that is dead or late.
+        """Prepare for ``reset``, with the lock held: restart a worker that is dead or late.
         Raises ``AlreadyPendingCallError``: the worker owes an answer.
         """
         if self.busy:
@@ -110,7 +109,7 @@ class WorkerQueue:
         self._make_ready("reset")
 
     def _is_ready(self, operation: str) -> bool:
-        """Whether a request can be sent at once; a reset first looks whether the worker lives."""
+        """Whether a request can be sent at once; a reset always checks the worker first."""
         return operation != "reset" and self.part.lifecycle.state is State.READY
 
     def _make_ready(self, operation: str) -> None:
@@ -122,16 +121,16 @@ class WorkerQueue:
             self._requests.make_ready(operation)
 
     def step(self, actions: Any) -> None:
-        """After ``prepare``, send it a step. Where that fails, ``take`` raises it."""
+        """Send the worker a step, after ``prepare``. If this fails, ``take`` raises the error."""
         if not self._owed:
             self._try("step", partial(self._requests.submit_step, actions))
         elif not self._waiting and self._requests.takes_more():
             self._try("step", partial(self._requests.submit_ahead, actions))
         else:
-            self._waiting.append(copy.deepcopy(actions))  # its owner may write the next ones there
+            self._waiting.append(copy.deepcopy(actions))  # the caller may reuse its array
 
     def reset(self, message_for: MessageFor) -> None:
-        """After ``prepare_reset``, send it a reset; as ``step``."""
+        """Send the worker a reset, after ``prepare_reset``; fails as ``step``."""
 
         def send() -> None:
             packed = self._requests.pack("reset", message_for)
@@ -151,17 +150,18 @@ class WorkerQueue:
             self._begin()
 
     def _begin(self) -> None:
-        """The worker is at the oldest request now."""
+        """Start the deadline of the oldest request, at which the worker is now."""
         is_step = self._owed[0] == "step"
         self._deadline = Deadline(self._timeouts.step_s if is_step else self._timeouts.reset_s)
 
     # --- receiving -------------------------------------------------------------------------------
 
     def take(self, keep: Callable[[StepResult], None]) -> None:
-        """With the lock held, ``keep`` the oldest request's results; a reset has rewards of 0.
+        """Take the oldest request's results, with the lock held, and pass them to ``keep``.
 
-        Raises as ``Requests.collect_step`` and ``collect`` do; the error names the
-        sub-environments. A worker that is not ready afterwards owes nothing more.
+        Results of a reset have rewards of 0. Raises as ``Requests.collect_step`` and ``collect``
+        do; the error names the sub-environments. If the worker is not READY afterwards, nothing is
+        owed any more.
         """
         if not self._owed:
             failure, self.failure = self.failure, None
@@ -182,7 +182,7 @@ class WorkerQueue:
 
     @contextmanager
     def _naming(self) -> Iterator[None]:
-        """Have an error say whose it is."""
+        """Add to an error the sub-environments that it concerns."""
         try:
             yield
         except EnvHubError as error:
@@ -194,7 +194,7 @@ class WorkerQueue:
         *result, infos = self._collect()
         infos = self._results().joined(infos)
         if len(result) > 1:
-            return (*result, infos)  # a step's
+            return (*result, infos)  # of a step
         no = np.zeros(self.count, np.bool_)
         return result[0], np.zeros(self.count), no, no.copy(), infos
 
@@ -209,7 +209,7 @@ class WorkerQueue:
         return self._requests.finish_reset(replies, self._deadline)
 
     def _check(self, result: StepResult) -> None:
-        """Whether it can be joined with others' results. Trust: input from the worker."""
+        """Raise if a result cannot be joined with other workers'. Trust: input from the worker."""
         try:
             if result[1].ndim != 1:
                 raise RemoteProtocolError("the worker sent rewards that are not one number each")
@@ -220,11 +220,12 @@ class WorkerQueue:
                 raise remote_error(name, name, text)
             batches.check_infos(result[4], self.count)
         except BaseException:
-            with self._requests.use.judging("recv"):  # on failure only: it costs some us
+            with self._requests.use.judging("recv"):  # only on failure, as it costs microseconds
                 raise
 
     def _go_on(self) -> None:
-        """After an answer: to the next request, if the worker is able to."""
+        """After an answer, go on to the next request, if the worker is READY."""
+        # ``taking`` is cleared last: until then an interrupt finds it set, and ``recv`` refuses.
         self._owed.popleft()
         if self.part.lifecycle.state is not State.READY:
             self.forget()
@@ -238,10 +239,10 @@ class WorkerQueue:
         self.taking = False
 
     def drop(self) -> None:
-        """With the lock held, wait for what is owed, and forget it."""
+        """Wait for the answers that are owed, with the lock held, and drop them."""
         self._waiting.clear()
         while self._owed and not self.interrupted:
-            with suppress(EnvHubError):  # a reset that follows meets what is wrong
+            with suppress(EnvHubError):  # the reset that follows handles the failure
                 self.take(lambda result: None)
         self.forget()
 
