@@ -1,1 +1,1 @@
-"""The Gymnasium face: vector environments, suites, and what a manifest makes of them."""
+"""Gymnasium's interface: vector environments, single environments and suites."""

@@ -1,8 +1,8 @@
-"""Actions as the caller has them, made into the batch that the action space asks for; and seeds.
+"""Converts a caller's actions to a batch of the action space, and checks seeds and masks.
 
-Arrays, lists, tuples, mappings and torch tensors are taken. Dtypes are kept as they are where
-the space could mean them (``float64`` for a ``float32`` Box), because that is what an environment
-in this process would see. Followed: ``gymnasium.vector.utils.iterate``.
+Actions may be arrays, lists, tuples, mappings and torch tensors. A dtype that the space accepts is
+kept (``float64`` for a ``float32`` Box), because an environment in this process would see it, too.
+Followed: ``gymnasium.vector.utils.iterate``.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ _INTEGERS = frozenset("iub")
 _NUMBERS = frozenset("fiub")
 _DTYPES = frozenset(BOX_DTYPES.values())
 _PYTHONS = {np.dtype(kind): kind for kind in (bool, int, float)}
-"""What numpy makes of lists of such numbers."""
+"""The Python class whose lists become an array of the dtype."""
 
 
 class UniterableError(ActionTypeError, CustomSpaceError):
-    """A scalar in place of several members of a space without arrays, as Gymnasium raises it."""
+    """A scalar in place of a batch of a space without arrays. Gymnasium raises this, too."""
 
 
 class SeedError(TypeError, Error):
-    """A seed that is no Python integer; Gymnasium's environments refuse it, too."""
+    """A seed that is not a Python integer. Gymnasium's environments refuse it, too."""
 
     def __init__(self, seed: object) -> None:
         super().__init__(f"Seed must be a python integer, actual type: {type(seed)}: use int(seed)")
@@ -42,10 +42,10 @@ class SeedError(TypeError, Error):
 
 @singledispatch
 def batch_of(space: gym.Space[Any], value: Any, count: int | None, name: str = "actions") -> Any:
-    """A batch of ``count`` members of a *single* action space; of a batched one for None.
+    """Check a batch of ``count`` members of a *single* space; ``count`` None: of a batched space.
 
-    Returns arrays of shape ``(count, *space.shape)``, in dicts and tuples as the space has them, or
-    lists of Python's numbers in place of arrays. ``name`` is the batch's name in errors.
+    Returns arrays of shape ``(count, *space.shape)``, in the space's dicts and tuples, or lists of
+    Python numbers in place of arrays. ``name`` is the batch's name in errors.
     Raises ``ActionError``: a wrong shape, dtype or structure.
     """
     if count is None:
@@ -71,7 +71,7 @@ def _batch_of_arrays(
     array = value if type(value) is np.ndarray else _array(space, value, name)
     shape = _shape(space, count)
     dtype = np.dtype(space.dtype)
-    # an empty list has numbers of no kind
+    # an empty list says nothing about the kind of its numbers
     if array.shape != shape or (array.size and array.dtype.kind not in _kinds_for(space)):
         kind = ActionError if array.shape else ActionTypeError
         of = "all" if count is None else count
@@ -117,7 +117,7 @@ def _batch_of_tuples(
 
 
 def action_reader(manifest: EnvManifest, count: int) -> Callable[[Any], Any]:
-    """A function that checks a batch of ``count`` actions and makes it what the worker takes.
+    """A function that checks a batch of ``count`` actions, and returns the batch for the worker.
     Trust: a manifest is input from the worker.
     """
     single, own = manifest.single_action_space, manifest.own_batch("action_space")
@@ -129,7 +129,7 @@ def action_reader(manifest: EnvManifest, count: int) -> Callable[[Any], Any]:
 
 
 class ActionReader:
-    """``batch_of`` for one environment, with what does not change worked out once."""
+    """``batch_of`` for one environment, which computes shape and dtypes once."""
 
     def __init__(self, space: gym.Space[Any], count: int | None) -> None:
         self._space = space
@@ -142,7 +142,7 @@ class ActionReader:
             self._dtypes = frozenset(dtype for dtype in _DTYPES if dtype.kind in kinds)
 
     def read(self, actions: Any) -> Any:
-        """The batch; raises as ``batch_of`` does."""
+        """Check a batch and return it; raises as ``batch_of`` does."""
         if type(actions) is np.ndarray and (
             actions.shape == self._shape and actions.dtype in self._dtypes
         ):
@@ -154,7 +154,7 @@ class ActionReader:
 
 
 def seeds_for_all(seed: Any, manifest: EnvManifest) -> Any:
-    """One seed or None per sub-environment, or None for none at all."""
+    """A list with a seed or None for each sub-environment, or None if there is no seed."""
     count = manifest.num_envs
     if isinstance(seed, int):
         return [seed + index for index in range(count)] if manifest.shardable else seed
@@ -180,7 +180,7 @@ def _seed(seed: Any) -> int:
 
 
 def check_mask(mask: Any, num_envs: int) -> None:
-    """``SyncVectorEnv.reset``'s checks, in its words."""
+    """Check a reset mask as ``SyncVectorEnv.reset`` does, with the same error texts."""
     if not isinstance(mask, np.ndarray):
         raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")
     if mask.shape != (num_envs,):
@@ -197,10 +197,10 @@ def check_mask(mask: Any, num_envs: int) -> None:
 
 
 def reset_message(manifest: EnvManifest, seeds: Any, options: Any, mask: Any = None) -> MessageFor:
-    """Makes a shard's part of a reset."""
+    """Returns a function that makes the message of a reset for each shard."""
     sliced = manifest.shardable and seeds is not None
 
-    def message(number: int, bounds: Bounds) -> m.Message:  # is kept: it refers to no environment
+    def message(number: int, bounds: Bounds) -> m.Message:  # kept: must not refer to an environment
         start, stop = bounds
         some = seeds[start:stop] if sliced else seeds
         return m.Reset(number, some, options, None if mask is None else mask[start:stop])
@@ -216,7 +216,7 @@ def _shape(space: gym.Space[Any], count: int | None) -> tuple[int, ...]:
 
 
 def _is_listed(value: Any, array: Any) -> bool:
-    """Whether ``array.tolist()`` equals the value: lists of numbers of one class."""
+    """Whether the value is lists of numbers of one class, equal to ``array.tolist()``."""
     kind = _PYTHONS.get(array.dtype)
     if kind is None or type(value) not in (list, tuple):
         return False
@@ -228,7 +228,7 @@ def _is_listed(value: Any, array: Any) -> bool:
 
 
 def _native(array: Any) -> Any:
-    """The same numbers in a dtype that can cross: native byte order, at most 64 bits."""
+    """The same numbers in a dtype that can be sent: native byte order, at most 64 bits."""
     if array.dtype in _DTYPES:
         return array
     wide = array.dtype.itemsize > np.dtype(np.float64).itemsize

@@ -1,11 +1,12 @@
-"""The random generators of an environment, as the caller's own.
+"""The random generators of an environment, which the caller can use.
 
-In one process the environment and its wrappers draw from one generator. Here the caller has a
-generator with the state of the one in the jail, and both follow each other:
+In one process the environment and its wrappers draw from the same generator. Here the caller gets a
+copy of the generator in the jail, and their states are kept equal:
 
 - Before a request, the jail gets the state of each generator that the caller has drawn from.
-- After it, the caller's generator is out of date, until ``np_random`` is read again. One that the
-  caller has kept is updated at once, since its next use cannot be seen.
+- After a request, the caller's generator is out of date until ``np_random`` is read again. If the
+  caller has kept a reference to the generator, it is updated at once, since its next use cannot be
+  noticed.
 """
 
 from __future__ import annotations
@@ -27,16 +28,17 @@ from envhub_worker.protocol.spaces.spaces import BIT_GENERATORS
 
 _NUMBER = "number"
 _SAID_NEXT = (WorkerError, RemoteEnvError, AlreadyPendingCallError, ClosedEnvironmentError)
-"""Errors of reading generators that must not hide a request's answer; the next one raises them."""
+"""Errors of reading generators after a request, which must not hide its answer. The next request
+raises them."""
 
 
 class _Live:
-    """One generator.
+    """One generator of the caller, and its counterpart in the jail.
 
     Attributes:
-        generator: The caller's.
+        generator: The caller's generator.
         number: The worker's number of its generator object; None before it is known.
-        known: The last state that both had.
+        known: The last state that both generators had.
     """
 
     def __init__(self, generator: np.random.Generator, number: int | None) -> None:
@@ -45,25 +47,25 @@ class _Live:
         self.known = generator.bit_generator.state
 
     def drawn(self) -> dict[str, Any] | None:
-        """Its state if the caller has drawn from it; None otherwise."""
+        """The state if the caller has drawn from the generator; None otherwise."""
         state: Any = self.generator.bit_generator.state
         return None if _equal(state, self.known) else state
 
     def references(self) -> tuple[int, int]:
-        """How many there are to the generator, and to its bits."""
+        """The reference counts of the generator and of its bit generator."""
         return sys.getrefcount(self.generator), sys.getrefcount(self.generator.bit_generator)
 
 
 _UNKEPT = _Live(np.random.Generator(np.random.PCG64(0)), 0).references()
-"""The references to a generator that only this module has."""
+"""The reference counts of a generator that only this module refers to."""
 
 
 class Generators:
-    """The generators of a vector environment: one of each sub-environment, or its own one.
-    ``requests``: those of the vector environment.
+    """The generators of a vector environment: one for each sub-environment, or one for all.
+    ``requests``: the requests of the vector environment.
 
     Attributes:
-        single: Whether there is but one, of a repository's own class; known once it was read.
+        single: Whether a repository's own class has one generator; known after the first read.
     """
 
     def __init__(self, requests: RequestOrder) -> None:
@@ -74,15 +76,15 @@ class Generators:
         self._asking = False
 
     def read(self) -> list[np.random.Generator]:
-        """The caller's generators, up to date."""
+        """Update the caller's generators and return them."""
         with self._requests.use.lock:
             if not self._current:
                 self._fetch()
             return [live.generator for live in self._live]
 
     def put(self, index: int, value: Any) -> None:
-        """Make this the generator of a sub-environment, as ``env.np_random = value`` does.
-        Raises ``TypeError``: its state cannot be sent.
+        """Replace the generator of a sub-environment, as ``env.np_random = value`` does.
+        Raises ``TypeError``: the generator's state cannot be sent.
         """
         bits: Any = getattr(value, "bit_generator", None)
         if not isinstance(value, np.random.Generator) or type(bits) not in BIT_GENERATORS:
@@ -90,7 +92,7 @@ class Generators:
             raise TypeError(f"np_random takes a numpy Generator of {names}, got {value!r}")
         with self._requests.use.lock:
             count = len(self.read())
-            self.before_request()  # the draws from others
+            self.before_request()  # send the caller's draws from the other generators
             states: list[Any] = [None] * count
             states[index] = bits.state
             self.write(states, new=True)
@@ -98,8 +100,8 @@ class Generators:
             self._fetch()
 
     def write(self, states: Sequence[Any], *, new: bool = False) -> None:
-        """Send states to the generators in the jail; None leaves one as it is.
-        ``new``: whether each is another generator, and not the same one after some draws.
+        """Send states to the generators in the jail; None leaves a generator unchanged.
+        ``new``: whether the states are those of new generators, not of the same ones after draws.
         """
 
         def message(number: int, bounds: tuple[int, int]) -> m.Message:
@@ -109,16 +111,16 @@ class Generators:
         self._ask(message)
 
     def before_request(self) -> None:
-        """Send what the caller has drawn; from then on its generators are out of date."""
+        """Send states that the caller's draws have changed; its generators are then out of date."""
         if not self._current or self._asking:
             return
-        self._current = False  # also where they cannot be sent: a reset is no way back else
+        self._current = False  # first: if sending fails, a reset must not try the same again
         states = [live.drawn() for live in self._live]
         if any(state is not None for state in states):
             self.write(states)
 
     def after_request(self) -> None:
-        """Update the generators that the caller has kept."""
+        """Update the generators to which the caller has kept references."""
         if self._current or self._asking or self._requests.waiting is not None:
             return
         if any(live.references() != _UNKEPT for live in self._live):
@@ -127,7 +129,7 @@ class Generators:
 
     def _fetch(self) -> None:
         replies = self._ask(for_every_shard(m.GetRandom))
-        with UNTRUSTED:  # a generator that numpy does not know breaks no rule of the wire
+        with UNTRUSTED:  # numpy may refuse a state that the protocol permits
             self.single = type(replies[0].value) is dict
             if self.single:
                 states: Sequence[Any] = [replies[0].value]
@@ -149,7 +151,7 @@ class Generators:
 
 
 def _read(value: Any) -> _Live:
-    """Trust: input from the worker."""
+    """A generator from the worker's description of it. Trust: input from the worker."""
     if type(value) is not dict or type(value.get(_NUMBER)) is not int:
         raise RemoteProtocolError("the worker sent a random generator without a number")
     state = {name: part for name, part in value.items() if name != _NUMBER}
@@ -157,7 +159,7 @@ def _read(value: Any) -> _Live:
 
 
 def _followed(old: _Live, new: _Live) -> _Live:
-    """The caller's generator in its new state, or a new one if the environment has another."""
+    """The caller's generator in its new state, or a new one if the environment has replaced its."""
     bits, fresh = old.generator.bit_generator, new.generator.bit_generator
     if old.number not in (None, new.number) or type(bits) is not type(fresh):
         return new

@@ -1,7 +1,8 @@
-"""HTML for notebooks: tables of environments, in which all that comes from a worker is escaped.
+"""HTML tables of environments for notebooks; everything that comes from a worker is escaped.
 
-No request is sent: a picture shows the frame that the caller rendered last. Names and spaces come
-from the worker: they are bounded, and escaped as text. Frames are numbers, encoded here.
+It sends no request: a picture shows the frame that the caller rendered last. Names and spaces come
+from the worker, so they are bounded and escaped as text. Frames are arrays of numbers, and this
+process encodes them.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ _HEAD = ("suite", "task", "environments", "observations", "actions")
 
 
 def environment_html(env: Any, layers: Iterable[Mapping[str, Any]], rendered: Any = None) -> str:
-    """A table of one environment: its spaces, and the layers that confine it.
-    ``rendered``: by the first sub-environment; a frame is shown below the table.
+    """A table of one environment, with its spaces and the layers that confine it.
+    ``rendered``: what the first sub-environment rendered last; a frame is shown below the table.
     """
-    held: dict[str, bool] = {}  # by each of its workers
+    held: dict[str, bool] = {}  # whether all workers enforce the layer
     for layer in layers:
         name = str(layer.get("layer"))
         held[name] = held.get(name, True) and bool(layer.get("enforced"))
@@ -49,7 +50,7 @@ def _counted(layers: list[str]) -> str:
 
 
 def _picture(rendered: Any) -> str:
-    """A frame as a small picture; nothing of anything else."""
+    """The HTML of a frame as a small picture; empty if this is not a frame."""
     if not is_frame(rendered):
         return ""
     data = base64.b64encode(png(small_picture(rendered, _SIDE))).decode()
@@ -57,7 +58,7 @@ def _picture(rendered: Any) -> str:
 
 
 def suites_html(suites: Mapping[Any, Mapping[Any, Any]]) -> str:
-    """A table of all environments, a line each."""
+    """A table of all environments, with a row for each."""
     lines = [(suite, task, env) for suite, tasks in suites.items() for task, env in tasks.items()]
     rows = "".join(map(_row, lines[:_ROWS]))
     more = f"<p>and {len(lines) - _ROWS} more</p>" if len(lines) > _ROWS else ""
@@ -73,5 +74,5 @@ def _row(line: tuple[Any, Any, Any]) -> str:
 
 
 def _text(value: object) -> str:
-    # numpy aligns the numbers of a Box with spaces, of which HTML shows one
+    # numpy aligns the numbers of a Box with several spaces, which HTML shows as one
     return html.escape(" ".join(one_line(str(value), _CHARS).split()))

@@ -1,4 +1,4 @@
-"""Small pictures of frames, encoded here from numbers: no bytes of a worker are passed on."""
+"""Encodes frames as small PNG pictures from their numbers; no bytes of a worker are passed on."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ Frame: TypeAlias = "NDArray[np.uint8]"
 
 
 def is_frame(value: Any) -> bool:
-    """Whether it is one, and not empty."""
+    """Whether a value is a frame that is not empty."""
     right = isinstance(value, np.ndarray) and value.dtype == np.uint8 and value.ndim == 3
     return right and value.shape[2] == 3 and value.size > 0
 
 
 def small_picture(frame: Frame, side: int) -> Frame:
-    """A frame of which no side is longer than that: the mean of each block of pixels."""
+    """Shrink a frame to at most ``side`` pixels a side, by the mean of each block of pixels."""
     block = -(-max(frame.shape[:2]) // side)
     if block <= 1:
         return frame
-    # a side that is shorter than a block, of a frame of one line, is a block of its own
+    # if a side is shorter than a block, as in a frame of one line, the block is that short
     down, across = (min(block, length) for length in frame.shape[:2])
     height, width = frame.shape[0] // down, frame.shape[1] // across
     blocks = frame[: height * down, : width * across].reshape(height, down, width, across, 3)

@@ -1,4 +1,4 @@
-"""``env.sandbox``: what a user may ask about the sandbox around an environment."""
+"""``env.sandbox``: answers a user's questions about the sandbox around an environment."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 class SandboxView:
-    """The confinement of an environment, what it uses, what it was denied, and counters.
+    """Shows the confinement of an environment, its resource usage, denials and counters.
 
     The data come from the client and its worker server, never from the repository. Each method may
     be called at any time, from any thread.
@@ -23,7 +23,7 @@ class SandboxView:
         return [dict(layer) for layer in self._session.report()]
 
     def usage(self) -> dict[str, int]:
-        """What its jail uses now, counted by the worker server from outside.
+        """What the environment's jail uses now, counted by the worker server from outside.
 
         Returns:
             ``processes`` and ``threads`` (beyond one for each process); for the processes that run
@@ -33,11 +33,11 @@ class SandboxView:
         return self._session.usage()
 
     def memory_limit(self) -> int:
-        """Bytes that its processes may use by the policy: the limit of a jail, times its jails."""
+        """The bytes that its processes may use: the policy's limit of a jail, times its jails."""
         return self._session.jails * self._session.repository.policy.limits.memory_bytes
 
     def denials(self) -> tuple[str, ...] | None:
-        """Denied attempts of its jail, recorded by the jail's first process.
+        """The denied attempts of its jail, which the jail's first process has recorded.
 
         Returns:
             System calls (``"ptrace"``, ``"socket AF_INET"``), files outside its own folders
@@ -60,8 +60,8 @@ class SandboxView:
         return self._session.stats()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Also for copy and deepcopy: what it looks at has sockets and processes, which a half-made
-        # copy would close. The environment itself can be copied and has a view of its own.
+        # Also for copy and deepcopy: the session has sockets and processes, which an incomplete
+        # copy of it would close. The environment itself can be copied and has a view of its own.
         raise TypeError(f"{self!r} is of one running environment; copy or pickle that environment")
 
     def __repr__(self) -> str:

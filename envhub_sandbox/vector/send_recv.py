@@ -1,4 +1,4 @@
-"""``send`` and ``recv``: steps of some sub-environments, of which several may be on their way."""
+"""``send`` and ``recv``: step some of the sub-environments, with several steps in flight."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class SendRecv(VectorEnv[Any, Any, Any]):
-    """What a ``SandboxVectorEnv`` has beyond Gymnasium's interface, for its requests in flight."""
+    """The methods of a ``SandboxVectorEnv`` for requests in flight, which Gymnasium lacks."""
 
     def __init__(self, session: AnySession) -> None:
         self._session = session
@@ -132,7 +132,7 @@ class SendRecv(VectorEnv[Any, Any, Any]):
             return received
 
     def _send_draws(self) -> None:
-        """Before anything is in flight: then no generator can be asked for."""
+        """Send the caller's draws before anything is in flight; later no request may be sent."""
         if self._requests.before_request is not None and self._requests.waiting is None:
             self._requests.before_request()
 
@@ -146,7 +146,7 @@ class SendRecv(VectorEnv[Any, Any, Any]):
         return self._flight
 
     def _read_rows(self, rows: Rows, actions: Any) -> Any:
-        """The batch of actions for these, checked as those of all are."""
+        """Check the batch of actions for some sub-environments, as a batch for all is checked."""
         count = len(rows.named)
         if count not in self._readers:
             self._readers[count] = action_reader(self._manifest, count)
@@ -154,7 +154,7 @@ class SendRecv(VectorEnv[Any, Any, Any]):
 
 
 def _seeds_of(rows: Rows, seed: Any, manifest: EnvManifest) -> Any:
-    """A seed or None for each sub-environment of all, of which those of ``rows`` count."""
+    """A list with a seed or None for every sub-environment; only the seeds of ``rows`` are used."""
     if seed is None or isinstance(seed, (int, np.integer)):
         return seeds_for_all(seed, manifest)
     seeds = list(seed)

@@ -1,8 +1,8 @@
-"""One sub-environment with the face of an ordinary ``gymnasium.Env``.
+"""One sub-environment with the interface of an ordinary ``gymnasium.Env``.
 
-For libraries that take single environments: Stable-Baselines3, tianshou, PufferLib, RLlib's default
-mode, TorchRL, and Gymnasium's wrappers. What lies below is a vector environment of one, so that a
-step takes the same way, the fast one, as every other.
+It is for libraries that take single environments: Stable-Baselines3, tianshou, PufferLib, RLlib's
+default mode, TorchRL, and Gymnasium's wrappers. Below it is a vector environment of one, so its
+steps use the same fast lane as all others.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.spaces import batches
 
 _DECLARED = frozenset({"action_space", "observation_space", "metadata", "render_mode"})
-"""Attributes that are known without a request; set here and in the environment."""
+"""Attributes that are read without a request; setting one sets it here and in the environment."""
 _OURS = frozenset(
     {"_apart", "_begun", "_close", "_observations", "_resets_in_the_same_step", "_spec", "_vector"}
 )
@@ -40,15 +40,16 @@ _PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 class SingleEnv(gym.Env[Any, Any]):
     """The only sub-environment of ``vector``, as a ``gymnasium.Env``.
 
-    A vector environment resets what has ended by itself; a ``gymnasium.Env`` does not. So an
-    observation that ends an episode is always the last one of that episode, and ``reset`` begins
-    the next. In the mode ``SAME_STEP`` the vector environment has begun it already, and ``reset``
-    without a seed or options returns that beginning instead of making another: as many resets
-    happen as were asked for.
+    A vector environment resets an ended sub-environment by itself; a ``gymnasium.Env`` does not. So
+    the observation of a step that ends an episode is always the last one of that episode, and
+    ``reset`` begins the next episode. In the mode ``SAME_STEP`` the vector environment has begun it
+    already: then ``reset`` without a seed or options returns that first observation and does not
+    reset again, so the number of resets is the number that the caller asked for.
 
     Args:
         vector: With ``num_envs`` 1.
-        close: Closes it and all that was made with it; None closes the vector environment alone.
+        close: Closes the environment and everything that was made with it; None closes the
+            vector environment alone.
 
     Raises:
         ValueError: ``vector`` has another number of sub-environments.
@@ -66,9 +67,9 @@ class SingleEnv(gym.Env[Any, Any]):
         self._close = close or vector.close
         self._apart = vector._apart() if isinstance(vector, SandboxVectorEnv) else None
         self._begun: tuple[Any, dict[str, Any]] | None = None
-        # as they were declared: the caller may set others
+        # the declared spaces, since the caller may set others
         self._observations = vector.single_observation_space, vector.observation_space
-        self.__dict__.update(  # not by __setattr__, which sets them in the environment as well
+        self.__dict__.update(  # not by __setattr__, which would set them in the environment as well
             observation_space=vector.single_observation_space,
             action_space=vector.single_action_space,
             metadata=metadata_of_one(vector),
@@ -84,13 +85,13 @@ class SingleEnv(gym.Env[Any, Any]):
 
     @property
     def sandbox(self) -> SandboxView:
-        """The layers around it, what it uses, what it was denied, and counters.
+        """Confinement, resource usage, denials and counters of the environment.
 
-        An attribute of this name of the environment's is ``env.vector.envs[0].sandbox``: its word
-        must not pass for these.
+        The environment's own attribute of this name is ``env.vector.envs[0].sandbox``, since its
+        claims must not be taken for these.
 
         Raises:
-            AttributeError: There is no sandbox: it was made with ``sandbox=None``.
+            AttributeError: There is no sandbox, because it was made with ``sandbox=None``.
         """
         view = getattr(self._vector, "sandbox", None)
         if not isinstance(view, SandboxView):
@@ -121,12 +122,12 @@ class SingleEnv(gym.Env[Any, Any]):
             return self._first(batch, scalars), info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """One step with ``action``, an element of ``action_space``.
+        """Step with ``action``, an element of ``action_space``.
 
         Returns:
-            Observation, reward, terminated, truncated, info. A number is a float; another reward
-            (a list, one for each agent) comes as it is. The observation of a step that ends the
-            episode is that episode's last.
+            Observation, reward, terminated, truncated, info. A reward that is a number is a float;
+            any other (a list with one for each agent) is unchanged. The observation of a step that
+            ends an episode is that episode's last.
 
         Raises:
             ActionError, WorkerTimeoutError, WorkerDiedError, RemoteEnvError: As
@@ -147,7 +148,7 @@ class SingleEnv(gym.Env[Any, Any]):
     def _of_one(
         self, batch: Any, rewards: Any, terminations: Any, truncations: Any, infos: Any
     ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """What a step of the only one returns."""
+        """Convert the results of a step of the vector environment to those of one environment."""
         [info, *more], scalars, odd = self._own(infos)
         observation = self._first(batch, scalars)
         terminated, truncated = bool(terminations[0]), bool(truncations[0])
@@ -156,23 +157,23 @@ class SingleEnv(gym.Env[Any, Any]):
             self._begun = observation, {**info, **(more[0] if more else {})}
             observation, info = batches.restore(self._observations[0], last), last_info
         reward = rewards[0]
-        if not np.ndim(reward):  # several are of a class that has them
+        if not np.ndim(reward):  # an array has several rewards, of a repository's own class
             reward = float(reward)
         return observation, odd[0] if odd else reward, terminated, truncated, info
 
     @short_traceback
     def render(self) -> Any:
-        """What the environment renders in its ``render_mode``."""
+        """The environment's rendering in its ``render_mode``, or None."""
         frames = self._vector.render()
         return None if frames is None else frames[0]
 
     def close(self) -> None:
-        """End its processes. Idempotent."""
+        """Close the environment and end its processes. Idempotent."""
         self._close()
 
     @property
     def np_random(self) -> np.random.Generator:
-        """The environment's generator, which a draw here advances, and the other way round."""
+        """The environment's generator; a draw here advances it there, and the other way round."""
         if isinstance(self._vector, SandboxVectorEnv):
             return self._vector._generators.read()[0]
         generator = self._vector.np_random
@@ -188,13 +189,13 @@ class SingleEnv(gym.Env[Any, Any]):
         else:
             self._vector.np_random = value
 
-    # Gymnasium's checks look at this one
+    # Gymnasium's checks read this attribute
     _np_random = np_random
 
     @property
     @short_traceback
     def np_random_seed(self) -> int:
-        """The seed of its generator, as Gymnasium has it: -1 if it is not known."""
+        """The seed of its generator; -1 if it is not known, as in Gymnasium."""
         seeds: Any = self._vector.np_random_seed
         seed = seeds[0] if isinstance(seeds, tuple) else seeds
         return -1 if seed is None else int(seed)
@@ -202,9 +203,9 @@ class SingleEnv(gym.Env[Any, Any]):
     @property
     @short_traceback
     def spec(self) -> Any:
-        """What was set here, or a spec from which ``gym.make`` makes the same, in a sandbox.
+        """The spec that was set, or one from which ``gym.make`` makes the same, in a sandbox.
 
-        Its limits are those of the environment's own spec, ``env.vector.envs[0].spec``.
+        Its limits come from the environment's own spec, ``env.vector.envs[0].spec``.
         """
         if "_spec" not in self.__dict__:
             self._spec = self._own_spec()
@@ -214,7 +215,7 @@ class SingleEnv(gym.Env[Any, Any]):
     def spec(self, value: Any) -> None:
         own = self._own_spec() if isinstance(value, EnvSpec) else None
         if own is not None and value.id == own.id and value.max_episode_steps is None:
-            value = copy(value)  # gym.make knows of no limit of the repository's
+            value = copy(value)  # gym.make does not know the repository's own limit
             value.max_episode_steps = own.max_episode_steps
         self._spec = value
 
@@ -225,16 +226,16 @@ class SingleEnv(gym.Env[Any, Any]):
             return spec if isinstance(spec, EnvSpec) else None
         facts = vector._manifest.spec
         if facts is None and not (vector._manifest.shardable or vector.closed):
-            inner = getattr(self._inner, "spec", None)  # of a class's own sub-environment
+            inner = getattr(self._inner, "spec", None)  # of the own class's first sub-environment
             facts = vars(inner) if isinstance(inner, EnvSpec) else None
         return vector._spec_again(facts)
 
     @short_traceback
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute where ``__getattr__`` finds it; a new one in the outermost wrapper.
+        """Set an attribute in the wrapper that has it; a new one in the outermost wrapper.
 
         Raises:
-            AttributeError: ``__getattr__`` serves no such name: ``set_wrapper_attr`` sets it.
+            AttributeError: ``__getattr__`` does not serve this name; use ``set_wrapper_attr``.
         """
         if name in _DECLARED:
             self._vector.set_attr(name, [value])  # type: ignore[attr-defined]
@@ -249,12 +250,12 @@ class SingleEnv(gym.Env[Any, Any]):
         object.__setattr__(self, name, value)
 
     def _is_local(self, name: str) -> bool:
-        """Whether it is ours, or of a class that somebody derives of this one."""
+        """Whether an attribute is ours, or of a class that is derived from this one."""
         derived = not type(self).__module__.startswith(_PACKAGE) and name.startswith("_")
         return name in _OURS or derived or name.startswith("__") or hasattr(type(self), name)
 
     def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
-        """Set it, also under names that ``__setattr__`` does not set; as in Gymnasium."""
+        """Set an attribute, also if ``__setattr__`` refuses its name; as in Gymnasium."""
         if self._is_own(name):
             setattr(self, name, value)
         elif force or self._inner.has_wrapper_attr(name):
@@ -264,19 +265,19 @@ class SingleEnv(gym.Env[Any, Any]):
         return True
 
     def __getattr__(self, name: str) -> Any:
-        """An attribute or a method of the environment, whichever of its wrappers has it."""
-        # where a property of ours raises AttributeError, Python calls this with its name
+        """An attribute or a method of the environment or of one of its wrappers."""
+        # if a property of ours raises AttributeError, Python calls this with the property's name
         ours = not is_servable(name) or hasattr(type(self), name)
         if "_vector" not in self.__dict__ or ours:
             raise absent(self, name, "get_wrapper_attr")
         return self._inner.get_wrapper_attr(name)
 
     def has_wrapper_attr(self, name: str) -> bool:
-        """Whether the environment, or a wrapper of it, has an attribute of that name."""
+        """Whether the environment or a wrapper of it has an attribute of this name."""
         return self._is_own(name) or bool(self._inner.has_wrapper_attr(name))
 
     def get_wrapper_attr(self, name: str) -> Any:
-        """That attribute, also under names that ``__getattr__`` does not serve (``size``)."""
+        """An attribute of this name, also if ``__getattr__`` does not serve it (``size``)."""
         return getattr(self, name) if self._is_own(name) else self._inner.get_wrapper_attr(name)
 
     @property
@@ -287,7 +288,7 @@ class SingleEnv(gym.Env[Any, Any]):
         return name in self.__dict__ or hasattr(type(self), name)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # copy and deepcopy, too: another one like it, with processes of its own
+        # also for copy and deepcopy: the copy has processes of its own
         return SingleEnv, (self._vector,)
 
     def __repr__(self) -> str:
@@ -296,14 +297,14 @@ class SingleEnv(gym.Env[Any, Any]):
     __str__ = __repr__
 
     def _repr_html_(self) -> str:
-        shown = getattr(type(self._vector), "_repr_html_", None)  # of the class: ours, or none
+        shown = getattr(type(self._vector), "_repr_html_", None)  # of our class, or None
         inside = "" if shown is None else shown(self._vector)
         return f"<code>{html.escape(repr(self))}</code>{inside}"
 
     def _batch(self, action: Any) -> Any:
         space = self._vector.single_action_space
         if type(action) in (bool, int, float):
-            return [action]  # arrives as it is
+            return [action]  # a Python number arrives as one
         if isinstance(space, _PLAIN):
             array = np.asarray(action)
             if array.shape != space.shape:
@@ -315,7 +316,7 @@ class SingleEnv(gym.Env[Any, Any]):
         return concatenate(space, [action], cast("Any", create_empty_array(space, 1)))
 
     def _first(self, batch: Any, scalars: Sequence[bool]) -> Any:
-        """The only observation; ``scalars`` says which discrete members were numbers of Python."""
+        """The only observation; ``scalars`` says which discrete members were Python numbers."""
         [first, *_] = batches.members(*self._observations, batch, 1)
         if True not in scalars:
             return first
@@ -324,7 +325,7 @@ class SingleEnv(gym.Env[Any, Any]):
     def _own(
         self, infos: dict[Any, Any]
     ) -> tuple[list[dict[Any, Any]], Sequence[bool], tuple[Any, ...]]:
-        """Its infos, of the end of an episode before those of the next; see ``Results.own``."""
+        """The infos, an episode's last before the next one's first; see ``Results.own``."""
         if self._apart is None:
             return [info_of(infos, 0, 1)], (), ()
         if not infos:
@@ -336,8 +337,9 @@ class SingleEnv(gym.Env[Any, Any]):
 def info_of(infos: dict[Any, Any], index: int, num_envs: int) -> dict[Any, Any]:
     """The info of sub-environment ``index``: the inverse of ``VectorEnv._add_info``.
 
-    A key counts if its mask, ``"_" + key``, bool ``(num_envs,)``, is set; mappings are nested. Keys
-    may be numbers, as in Gymnasium.
+    The info has a key if the key's mask, ``"_" + key``, bool ``(num_envs,)``, is set at the index,
+    or if there is no mask. Nested mappings are treated the same. Keys may be numbers, as in
+    Gymnasium.
     """
     info = {}
     masks = {f"_{key}" for key in infos}
@@ -355,4 +357,4 @@ def _of_one(value: Any, index: int, num_envs: int) -> Any:
         return info_of(value, index, num_envs)
     if isinstance(value, (np.ndarray, list, tuple)) and len(value) == num_envs:
         return value[index]
-    return value  # not of the sub-environments, but of the vector environment
+    return value  # a value of the vector environment, not one for each sub-environment

@@ -1,8 +1,8 @@
-"""One sub-environment: ``env.envs[0]``, as an ``Env`` that lives in the jail.
+"""One sub-environment, ``env.envs[0]``: a proxy of the ``Env`` in the jail.
 
-Followed: ``gymnasium.vector.SyncVectorEnv.envs``, which holds the environments themselves. A
-step or a reset of one of them does not change what the vector environment knows: it keeps the
-observation and the end of an episode of its own last step.
+Followed: ``gymnasium.vector.SyncVectorEnv.envs``, which has the environments themselves. A step or
+a reset of one of them changes no state of the vector environment, which keeps the observation and
+the end of an episode of its own last step.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from envhub_worker.protocol.spaces import batches
 
 _OUTERMOST = 0
 _SEARCHED = -1
-"""In place of a depth: whichever wrapper has it."""
+"""In place of a depth: the outermost wrapper that has the attribute."""
 _MOST_WRAPPERS = 1000
-"""Wrappers around one environment, which otherwise might be endless: about as many as the nested
-calls that Python permits, of which a step makes one for each."""
+"""The most wrappers around one environment, which a hostile worker could make endless. A step makes
+a nested call for each, of which Python permits about as many."""
 _OURS = frozenset({"_vector", "_index", "_depth"})
 
 
 def _declared(name: str, vector_name: str) -> Any:
-    """What is known of the first one without a request: the vector environment shows it."""
+    """A property that needs no request for the first one: the vector environment has its value."""
 
     def declared(env: SubEnvironment) -> Any:
         return getattr(env._vector, vector_name) if env._is_shown else env._get(name)
@@ -40,15 +40,16 @@ def _declared(name: str, vector_name: str) -> Any:
 
 
 def metadata_of_one(vector: Any) -> dict[str, Any]:
-    """Without the autoreset mode, which is a vector environment's alone."""
+    """The metadata without the autoreset mode, which only a vector environment has."""
     return {key: value for key, value in vector.metadata.items() if key != "autoreset_mode"}
 
 
 class SubEnvironment(gym.Env[Any, Any]):
-    """One sub-environment of a vector environment, and what its wrappers wrap.
+    """A proxy of one sub-environment of a vector environment, or of one of its wrappers.
 
-    Looking at a method asks whether it is one, and runs nothing. Attributes with an underscore and
-    names that libraries look for in any object are not asked for: ``get_wrapper_attr`` names them.
+    Reading a method asks the worker whether it is a method, and runs nothing. Attributes with an
+    underscore and names that libraries look for in any object are not requested; read them by
+    ``get_wrapper_attr``.
 
     Args:
         vector: Its ``SandboxVectorEnv``.
@@ -65,24 +66,24 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     @short_traceback
     def reset(self, *args: Any, **kwargs: Any) -> Any:
-        """Reset this one alone. The vector environment goes on as if it had not been."""
+        """Reset this sub-environment alone. The state of the vector environment does not change."""
         self._refuse_unless_sync("reset")
         return self._restored(self._call("reset", args, kwargs))
 
     @short_traceback
     def step(self, *args: Any, **kwargs: Any) -> Any:
-        """Step this one alone; as ``reset``."""
+        """Step this sub-environment alone; the vector environment's state does not change."""
         self._refuse_unless_sync("step")
         return self._restored(self._call("step", args, kwargs))
 
     @short_traceback
     def render(self, *args: Any, **kwargs: Any) -> Any:
-        """What this one renders."""
+        """The rendering of this sub-environment."""
         return self._call("render", args, kwargs)
 
     @short_traceback
     def close(self) -> None:
-        """Close it. Raises ``ValueError``: it is one of several, which cannot go on without it."""
+        """Close it. Raises ``ValueError``: there are others, which cannot continue without it."""
         if self._vector.num_envs > 1:
             raise ValueError(
                 f"cannot close sub-environment {self._index} of {self._vector.num_envs}: the "
@@ -100,8 +101,9 @@ class SubEnvironment(gym.Env[Any, Any]):
     @property
     @short_traceback
     def env(self) -> Any:
-        """What this wrapper wraps.
-        Raises ``AttributeError``: it is no wrapper; ``RemoteProtocolError``: they are endless.
+        """The environment that this wrapper wraps.
+        Raises ``AttributeError``: this is not a wrapper; ``RemoteProtocolError``: there are too
+        many wrappers.
         """
         if self._depth is not None and self._depth >= _MOST_WRAPPERS:
             raise RemoteProtocolError(f"the worker says that more than {_MOST_WRAPPERS} wrap one")
@@ -110,28 +112,28 @@ class SubEnvironment(gym.Env[Any, Any]):
             return wrapped
         return SubEnvironment(self._vector, self._index, self._depth + 1)
 
-    # a copy, but for the first one's, which is the vector environment's own
+    # copies, but the first sub-environment has the vector environment's own objects
     action_space = _declared("action_space", "single_action_space")
     observation_space = _declared("observation_space", "single_observation_space")
     render_mode = _declared("render_mode", "render_mode")
 
     @property
     def metadata(self) -> Any:  # type: ignore[override]
-        """Its metadata."""
+        """The metadata of this sub-environment."""
         return metadata_of_one(self._vector) if self._is_shown else self._get("metadata")
 
     @property
     @short_traceback
     def spec(self) -> Any:  # type: ignore[override]
-        """Its spec: facts, of which ``gym.make`` makes nothing."""
+        """The spec of this sub-environment: facts only, not usable by ``gym.make``."""
         return self._get("spec")
 
     @property  # type: ignore[misc]  # there is nothing to set
     @short_traceback
     def np_random(self) -> Any:
-        """Its generator: a draw here advances it there, and the other way round.
+        """The generator: a draw here advances it in the jail, and the other way round.
 
-        A copy where the repository's own class has its sub-environments.
+        A copy if the repository's own class has the sub-environments.
         """
         if self._vector._manifest.shardable:
             return self._vector._generators.read()[self._index]
@@ -140,7 +142,7 @@ class SubEnvironment(gym.Env[Any, Any]):
     @property
     @short_traceback
     def np_random_seed(self) -> Any:
-        """Its seed."""
+        """The seed of its generator."""
         seed = self._get("np_random_seed")
         with UNTRUSTED:
             return seeds(seed)
@@ -154,7 +156,7 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     @short_traceback
     def has_wrapper_attr(self, name: str) -> bool:
-        """Whether it has an attribute, or a wrapper of it."""
+        """Whether the sub-environment or a wrapper of it has an attribute of this name."""
         has_attribute = self._call("has_wrapper_attr", (name,), {})
         with UNTRUSTED:  # an array has no truth value
             return bool(has_attribute)
@@ -181,7 +183,7 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     @short_traceback
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute of it, there."""
+        """Set an attribute of the sub-environment in the jail."""
         if name in _OURS:
             object.__setattr__(self, name, value)
         elif name == "np_random" and self._vector._manifest.shardable:
@@ -233,7 +235,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         return typed_reply(reply, m.Value).value
 
     def _restored(self, result: Any) -> Any:
-        """The result of a reset or a step, with the classes that the space gives observations."""
+        """The result of a reset or a step, with observations in the classes of the space."""
         space = self._vector._manifest.single_observation_space  # the caller may set another one
         if type(result) is not tuple or not result or not batches.restores(space):
             return result

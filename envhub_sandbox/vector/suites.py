@@ -1,4 +1,4 @@
-"""What ``make_env`` returns: ``{suite: {task_id: VectorEnv}}``, which plays many tasks at once."""
+"""The result of ``make_env``, ``{suite: {task_id: VectorEnv}}``, and a map over its tasks."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from envhub_worker.protocol.text import parse_size, size_text
 
 T = TypeVar("T")
 Play = Callable[[str, Any, Any], T]
-"""Called with the suite, the task and its environment."""
+"""A caller's function of the suite, the task and the task's environment."""
 Envs = Mapping[str, Mapping[int | str, VectorEnv[Any, Any, Any]]]
 
 
 class Tasks(dict[Any, Any]):
-    """The environments of one suite, by task id; one that is not there is named with the others."""
+    """The environments of one suite, by task id; a KeyError lists the ids that exist."""
 
     def __init__(self, suite: str, tasks: Mapping[Any, Any]) -> None:
         super().__init__(tasks)
@@ -45,7 +45,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         envs: The environments.
         provenance: Makes ``provenance``.
         on_close: Runs after the environments have been closed.
-        recipe: Makes them again: a pickle starts workers of its own.
+        recipe: Makes the environments again; a pickle contains it, and so starts new workers.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
 
     @property
     def env(self) -> Any:
-        """The environment of a repository that has just one.
+        """The only environment of a repository that has one.
 
         Raises:
             ValueError: There are several; the text names them.
@@ -82,12 +82,12 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
 
     @property
     def reference(self) -> str | None:
-        """What makes the very same again: the commit is in it. None where code runs here."""
+        """A reference with the commit, which makes the same again. None for ``sandbox=None``."""
         return None if self._recipe is None else self._recipe.reference
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """What runs: commit, file hashes, interpreter, packages, what was installed, layers."""
+        """The run's commit, file hashes, interpreter, packages, installed packages and layers."""
         return self._provenance()
 
     def map(
@@ -97,25 +97,25 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         max_live_tasks: int | None = None,
         memory: int | str | None = None,
     ) -> dict[str, dict[Any, T]]:
-        """Play every task, several at a time within a budget, and close each after it was played.
+        """Play every task, several at a time within a budget, and close each task afterwards.
 
-        If there are more tasks than may live, one of the live tasks is the next one, which starts
-        while the others are played. Progress is shown on a terminal and in a notebook.
+        If there are more tasks than may have processes at a time, one of those with processes is
+        the next task, which starts while the others are played. Progress is shown on a terminal and
+        in a notebook.
 
         Args:
-            play: Called with the suite, the task and its environment. Tasks that are played at the
-                same time have a thread each.
+            play: Called with the suite, the task and its environment, in several threads at a time.
             max_live_tasks: How many tasks may have processes at the same time.
-            memory: Bytes that the limits of all live tasks may add up to, or a text such as
-                ``"16G"``. A task takes ``limits["memory_bytes"]``, in a fleet for each worker.
+            memory: The bytes that the memory limits of all tasks with processes may add up to, or a
+                text such as ``"16G"``. A task has ``limits["memory_bytes"]`` for each jail.
 
         Returns:
-            What ``play`` returned, by suite and task.
+            The results of ``play``, by suite and task.
 
         Raises:
             ValueError: Neither bound is given, or not one task fits.
-            Exception: The first that ``play`` raised. The tasks that were being played have ended,
-                no other was started, and all are closed.
+            Exception: The first exception of ``play``. The running tasks have ended, no other task
+                was started, and all environments are closed.
         """
         sizes = [env.sandbox.memory_limit() for env in _sandboxed(self)]
         live = live_tasks(memory, max_live_tasks, max(sizes, default=0))
@@ -157,7 +157,7 @@ def _sandboxed(suites: Envs) -> list[SandboxVectorEnv]:
 
 @contextlib.contextmanager
 def closed_if_it_fails(suites: EnvSuites) -> Iterator[EnvSuites]:
-    """Close them where what is done with them raises."""
+    """Close the environments if the body of this context raises."""
     try:
         yield suites
     except BaseException:
@@ -166,7 +166,7 @@ def closed_if_it_fails(suites: EnvSuites) -> Iterator[EnvSuites]:
 
 
 def for_lerobot(suites: EnvSuites) -> EnvSuites:
-    """The same, for LeRobot's programs: see ``serve_lerobot``."""
+    """Prepare the environments for LeRobot's programs (``serve_lerobot``), and return them."""
     for env in _sandboxed(suites):
         serve_lerobot(env)
     suites._serves_lerobot = True
@@ -180,8 +180,8 @@ def _again_for_lerobot(recipe: Recipe) -> EnvSuites:
 def choose(
     suites: EnvSuites, suite: str | None = None, task: int | str | None = None
 ) -> VectorEnv[Any, Any, Any]:
-    """The one environment of this suite and this task; None is whichever there is.
-    Raises ``ValueError``: there is not exactly one; the text names what there is.
+    """The only environment of this suite and task; None for any suite or any task.
+    Raises ``ValueError``: there is not exactly one; the text lists the existing ones.
     """
     chosen = _named(suites, suite, (task,))
     if len(chosen) == 1:
@@ -195,8 +195,8 @@ def choose(
 
 
 def keep_only(suites: EnvSuites, suite: str | None = None, task: int | str | None = None) -> None:
-    """Close and drop all but this suite and this task, which may be given as text.
-    Raises ``ValueError``: nothing would be left; the text names what there is.
+    """Close and drop all environments but this suite's and task's; the task may be a text.
+    Raises ``ValueError``: nothing would be left; the text lists the existing ones.
     """
     ids = [task_id for _, task_id in _named(suites, suite) if task in (task_id, str(task_id))]
     chosen = _named(suites, suite, (task, *ids))
@@ -212,7 +212,7 @@ def keep_only(suites: EnvSuites, suite: str | None = None, task: int | str | Non
 def _named(
     suites: EnvSuites, suite: str | None = None, tasks: tuple[int | str | None, ...] = (None,)
 ) -> list[tuple[str, int | str]]:
-    """The names of what is in this suite, or in any, and has one of these tasks' ids, or any."""
+    """The suite and task of each environment in this suite (None: any) with one of these tasks."""
     named = [(name, task) for name in suites for task in suites[name] if suite in (None, name)]
     return named if None in tasks else [pair for pair in named if pair[1] in tasks]
 
@@ -225,7 +225,7 @@ def _names(tasks: list[tuple[str, int | str]]) -> str:
 
 
 def live_tasks(memory: int | str | None, max_live_tasks: int | None, each_bytes: int) -> int:
-    """How many tasks of ``each_bytes`` may have processes at once: see ``EnvSuites.map``.
+    """How many tasks of ``each_bytes`` may have processes at a time: see ``EnvSuites.map``.
     Raises ``ValueError``: there is no bound, or not even one task fits.
     """
     if memory is None and max_live_tasks is None:
@@ -246,9 +246,9 @@ def live_tasks(memory: int | str | None, max_live_tasks: int | None, each_bytes:
 
 
 class TaskMap(Generic[T]):
-    """Plays tasks, of which at most ``live`` have processes at any time.
+    """Plays tasks so that at most ``live`` of them have processes at any time.
 
-    One of these is started ahead of its turn; the others are being played, each in a thread.
+    One of these is started ahead of its turn; the others are played, each in a thread.
     """
 
     def __init__(self, suites: Mapping[str, Mapping[Any, Any]], play: Play[T], live: int) -> None:
@@ -264,7 +264,7 @@ class TaskMap(Generic[T]):
         self._results: dict[tuple[str, Any], T] = {}
 
     def run(self) -> dict[str, dict[Any, T]]:
-        """What each returned, by suite and task; raises what the first one raised that failed."""
+        """Play all tasks; returns the results by suite and task, or raises the first failure."""
         with progress_shown("tasks", WORKER) as tell:
             self._tell = tell
             try:
@@ -284,7 +284,7 @@ class TaskMap(Generic[T]):
         }
 
     def _run(self) -> None:
-        """In each thread."""
+        """Play tasks until none is left or one has failed; runs in each thread."""
         try:
             while (next_task := self._next()) is not None:
                 suite, task = next_task
@@ -306,6 +306,6 @@ class TaskMap(Generic[T]):
             if self._ahead and self._left:
                 suite, task = self._left[0]
                 following = self._suites[suite][task]
-                if hasattr(following, "prewarm"):  # one of this process has nothing to start
+                if hasattr(following, "prewarm"):  # an environment of this process has none
                     following.prewarm()
             return next_task

@@ -1,9 +1,9 @@
-"""Short tracebacks: our own frames are removed from errors whose text says what went wrong.
+"""Short tracebacks: removes our own frames from errors whose text says what went wrong.
 
-An error of the repository ends with its author's line, and an error about an argument names it. A
-dozen frames of this package between the caller's line and that text hide both. So the caller's
-frames stay, and one of ours, which raises the error again. ``ENVHUB_TRACEBACK=full`` keeps all
-frames; the logger ``envhub_sandbox.errors`` has them at DEBUG.
+An error of the repository ends with its author's line, and an error about an argument names the
+argument. A dozen frames of this package would hide the caller's line and that text. So only the
+caller's frames stay, and one frame of ours, which raises the error again. ``ENVHUB_TRACEBACK=full``
+keeps all frames; the logger ``envhub_sandbox.errors`` shows them at DEBUG.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from envhub_worker.protocol.text import shortage
 
 _VARIABLE, _FULL = "ENVHUB_TRACEBACK", "full"
 _SHORT = 3
-"""Frames of an error that was shortened before, and passes another method of ours."""
+"""The most frames of an error that was shortened before and passes another of our methods."""
 _CHAINED = 20
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 def shortened(error: BaseException) -> bool:
-    """Remove the frames of an error; if this returns True, raise it again.
+    """Remove the frames of an error; returns whether, so that the caller raises it again.
 
     Protocol errors and errors of other packages keep their frames, which say where to look.
     """
@@ -42,7 +42,7 @@ def shortened(error: BaseException) -> bool:
 
 
 def short_traceback(ask: Callable[P, T]) -> Callable[P, T]:
-    """Decorate a function: its errors have the caller's frames and one of ours.
+    """Decorate a function so that its errors have only the caller's frames and one of ours.
 
     ``EMFILE``, ``ENOMEM`` and the like are raised as a ``WorkerError``.
     """
@@ -70,7 +70,7 @@ def _text_suffices(error: BaseException) -> bool:
 
 
 def _shorten_causes(error: BaseException) -> None:
-    """Remove the frames of its causes that are errors of this project."""
+    """Remove the frames of the causes of an error that are errors of this project."""
     cause = error.__cause__
     for _ in range(_CHAINED):
         if cause is None:

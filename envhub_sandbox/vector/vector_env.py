@@ -1,4 +1,4 @@
-"""The Gymnasium face of an environment that lives in a jail. Knows no sockets.
+"""Gymnasium's ``VectorEnv`` for an environment that lives in a jail. Knows no sockets.
 
 Followed: ``gymnasium.vector.AsyncVectorEnv`` for the calls and their errors, ``SyncVectorEnv`` for
 the results.
@@ -41,15 +41,15 @@ if TYPE_CHECKING:
     from envhub_sandbox.session.repository import Recipe
 
 _NOT_CALLED = frozenset({"reset", "step", "close"})
-"""What ``AsyncVectorEnv.call`` refuses: it would take one sub-environment from under the others."""
+"""Methods that ``AsyncVectorEnv.call`` refuses: the vector environment has its own."""
 
 _OURS = frozenset({"prewarm", "recv", "sandbox", "send", "send_reset"})
 """Public names that Gymnasium's vector environments do not have."""
 
 
 class VectorApart(NamedTuple):
-    """``reset`` (of seeds, options and a mask), ``step`` and ``step_wait`` with infos as they came,
-    and the functions of ``Results`` that read such infos.
+    """``reset`` (of seeds, options and a mask), ``step`` and ``step_wait`` with infos apart, and
+    the functions of ``Results`` that read such infos.
     """
 
     reset: Callable[..., tuple[Any, dict[Any, Any]]]
@@ -59,20 +59,20 @@ class VectorApart(NamedTuple):
     each: Callable[[dict[Any, Any]], list[list[dict[Any, Any]]]]
 
 
-# Gymnasium's class is named here as well, for libraries that look at direct bases alone (skrl)
+# Gymnasium's class is a direct base, too, for libraries that check only direct bases (skrl)
 class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     """A vector environment whose code runs in a confined process.
 
-    Everything that ``VectorEnv`` has, and ``AsyncVectorEnv``'s ``*_async`` and ``*_wait``. Arrays
-    that it returns belong to the caller: writable, and never changed by a later step. One thread
-    uses it at a time, and a second one waits, with a ``RuntimeWarning`` where both step; ``close``
-    may come from any.
+    It has all methods of ``VectorEnv``, and ``*_async`` and ``*_wait`` of ``AsyncVectorEnv``. The
+    caller owns the returned arrays: they are writable, and no later step changes them. One thread
+    at a time uses the environment; a second thread waits, with a ``RuntimeWarning`` if both step.
+    Any thread may call ``close``.
 
     Attributes:
         num_envs: Number of sub-environments.
         closed: Whether ``close`` has been called.
         metadata: With ``"autoreset_mode"``, as in Gymnasium.
-        sandbox: The layers around it, what it uses, what it was denied, and counters.
+        sandbox: Its confinement, resource usage, denials and counters.
     """
 
     def __init__(self, session: AnySession, again: Callable[[], AnySession] | None = None) -> None:
@@ -97,7 +97,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         if manifest.shardable:  # a repository's own class has others, or none
             self.autoreset_mode = self.metadata.get("autoreset_mode")
             self.copy = session.repository.copy
-            # the functions are in the sandbox: what stands for them here says so when it is called
+            # the functions are in the sandbox; these replacements raise an error that says so
             made_there = partial(not_here, reference=session.repository.label)
             self.env_fns = [made_there] * manifest.num_envs
             self.observation_mode = "same"
@@ -107,7 +107,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         self._warn_of_hidden_names()
 
     def _warn_of_hidden_names(self) -> None:
-        """Where the repository's vector environment has attributes that are ours here."""
+        """Warn if the repository's vector environment has attributes that ours hide."""
         hidden = _OURS.intersection(self._manifest.attributes)
         if hidden:
             warnings.warn(
@@ -125,12 +125,12 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     @short_traceback
     def prewarm(self) -> None:
-        """Start its processes now, in the background; returns at once.
+        """Start the processes now, in the background; returns at once.
 
-        The first ``reset`` then waits only for the rest of the start. Without it, processes start
-        when they are first needed, so that a suite of many tasks costs nothing before its use: an
-        evaluation can prewarm the next task while it plays one. The first request raises what
-        failed.
+        The first ``reset`` then waits only for the rest of the start. Otherwise processes start at
+        the first request, so that a suite of many tasks costs nothing before its use. An
+        evaluation can prewarm the next task while it plays one. If the start fails, the first
+        request raises the error.
         """
         self._requests.refuse_if_closed()
         for prewarm in self._session.prewarms:
@@ -149,13 +149,13 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
         Args:
             seed: One seed (sub-environment ``i`` gets ``seed + i``), one each, or None.
-            options: Handed to each sub-environment; ``"reset_mask"`` is bool ``(num_envs,)``.
+            options: Passed to each sub-environment; ``"reset_mask"`` is bool ``(num_envs,)``.
 
         Returns:
             Batched observation ``(num_envs, *single_observation_space.shape)``, and infos.
 
         Raises:
-            WorkerTimeoutError: Longer than ``Timeouts.reset_s``; call it again.
+            WorkerTimeoutError: It took longer than ``Timeouts.reset_s``; call it again.
             WorkerDiedError: The worker process ended.
             RemoteEnvError: The environment raised; it is still usable.
         """
@@ -185,16 +185,16 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
             self._requests.waiting = "reset"
 
     def _note_first_use(self) -> None:
-        """Tell of the first use before taking the lock, which a start ahead may hold for long."""
+        """Note the first use before taking the lock, which a start ahead may hold for long."""
         self._open_again()
         for prewarm in self._session.prewarms:
             if prewarm.starting is not None and not self.closed:
                 prewarm.note_use()
 
     def _open_again(self) -> None:
-        """Start again after a ``close``, with the same settings, where it serves LeRobot.
+        """If it serves LeRobot, start again after a ``close``, with the same settings.
 
-        A fork does not start again: the server that it would use is its parent's.
+        A fork does not start again, since the server belongs to its parent.
         """
         if not (self.closed and self._again and self._session.repository.for_lerobot):
             return
@@ -204,14 +204,14 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
                 SandboxVectorEnv.__init__(self, self._again(), self._again)
 
     def _refuse_if_busy_for_reset(self, options: dict[str, Any] | None) -> None:
-        """A reset of all drops what was sent and not received."""
+        """Refuse a reset while a request is pending; a reset of all drops those in flight."""
         if self._requests.waiting == SENT and "reset_mask" not in (options or {}):
             self._in_flight().drop()
         self._requests.refuse_if_busy("reset_async")
 
     def _send_reset(self, seed: Any, options: dict[str, Any] | None, mask: Any = None) -> None:
         if options is not None and "reset_mask" in options:
-            options = copy(options)  # the caller's own keep theirs
+            options = copy(options)  # the caller's mapping keeps its mask
             mask = options.pop("reset_mask")
             check_mask(mask, self.num_envs)
         seeds = seeds_for_all(seed, self._manifest)
@@ -228,7 +228,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     @short_traceback
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
-        """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
+        """The results of ``reset_async``; ``timeout`` in seconds, or ``Timeouts.reset_s``."""
         with self._requests.use.lock:
             self._requests.end_wait("reset")
             timeout_s = self._timeouts.reset_s if timeout is None else timeout
@@ -251,12 +251,12 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
         Raises:
             ActionError: A wrong shape or dtype; nothing was sent.
-            WorkerTimeoutError: Longer than ``Timeouts.step_s``; ``reset`` brings it back.
+            WorkerTimeoutError: It took longer than ``Timeouts.step_s``; call ``reset``.
             WorkerDiedError: The worker process ended.
             RemoteEnvError: The environment raised; it is still usable.
         """
         results = self._requests.results
-        try:  # without the decorator and step_async's calls: this is the method that is called most
+        try:  # without decorator and step_async, for speed: no method is called more often
             done = self._step(actions)
             return (*done[:4], results.joined(done[4])) if results.apart else done
         except EnvHubError as error:
@@ -289,7 +289,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     @short_traceback
     def step_wait(self, timeout: float | None = None) -> StepResult:
-        """The results of ``step_async``; ``timeout`` in seconds, else ``Timeouts.step_s``."""
+        """The results of ``step_async``; ``timeout`` in seconds, or ``Timeouts.step_s``."""
         *done, infos = self._step_wait(timeout)
         return (*done, self._requests.results.joined(infos))
 
@@ -308,13 +308,13 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         with self._requests.use.lock:
             self._requests.refuse_if_busy("call_async")
             if not (args or kwargs) and self._manifest.shardable:
-                own = name == "np_random" and self._manifest.sync  # or it would be copies
+                own = name == "np_random" and self._manifest.sync  # a request would return copies
                 return cast("tuple[Any, ...]", self.np_random) if own else self._read(name)
-            self._send_call(name, args, kwargs)  # as reset
+            self._send_call(name, args, kwargs)  # not by call_async, as _reset says
             return self._end_call(self._timeouts.call_s)
 
     def _read(self, name: str) -> tuple[Any, ...]:
-        """``call`` without arguments; what is read after each step is watched."""
+        """``call`` without arguments; attributes that are read after each step are watched."""
         attributes = self._requests.attributes
         values = attributes.get(name)
         if isinstance(values, RemoteEnvError):
@@ -324,7 +324,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         return self._watched(name) if attributes.should_watch(name) else self._called(name)
 
     def _watched(self, name: str) -> tuple[Any, ...]:
-        """Ask for an attribute, and have its value or its absence watched from now on."""
+        """Read an attribute, and have its value or its absence watched from now on."""
         attributes = self._requests.attributes
         self._send_call(name, (), {}, for_every_shard(m.Watch, name))
         replies = self._requests.collect(self._timeouts.call_s, m.WatchDone)
@@ -368,7 +368,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     @short_traceback
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
-        """The results of ``call_async``; ``timeout`` in seconds, else ``Timeouts.call_s``."""
+        """The results of ``call_async``; ``timeout`` in seconds, or ``Timeouts.call_s``."""
         with self._requests.use.lock:
             self._requests.end_wait("call")
             return self._end_call(self._timeouts.call_s if timeout is None else timeout)
@@ -381,7 +381,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     @short_traceback
     def get_attr(self, name: str) -> tuple[Any, ...]:
-        """An attribute of every sub-environment."""
+        """The values of an attribute, one for each sub-environment."""
         return self.call(name)
 
     @short_traceback
@@ -401,7 +401,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     @short_traceback
     def render(self) -> tuple[Any, ...] | None:
-        """What each sub-environment renders; None if the environment returns None."""
+        """The renderings of the sub-environments; None if the vector environment returns None."""
         replies = self._requests.ask("render", for_every_shard(m.Render))
         if self._manifest.shardable:
             rendered = self._requests.one_each("render", replies)
@@ -413,10 +413,10 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     @property
     @short_traceback
     def np_random(self) -> Any:
-        """The generator of each sub-environment, or the one of a repository's own class.
+        """The generator of each sub-environment, or the only one of a repository's own class.
 
-        A draw here advances the environment's generator, and the other way round. Those of an
-        ``AsyncVectorEnv`` are copies, as in Gymnasium.
+        A draw here advances the environment's generator, and the other way round. The generators of
+        an ``AsyncVectorEnv`` are copies, as in Gymnasium.
         """
         generators = self._generators.read()
         if self._generators.single:
@@ -437,7 +437,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     @property
     @short_traceback
     def np_random_seed(self) -> Any:
-        """Their seeds."""
+        """The seeds of the generators."""
         name = "np_random_seed"
         replies = self._requests.ask(name, for_every_shard(m.GetOwn, name))
         if type(replies[0].value) is not tuple:
@@ -451,18 +451,18 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     @property
     def sandbox(self) -> SandboxView:
-        """The layers around it, what it uses, what it was denied, and counters.
+        """Confinement, resource usage, denials and counters of the environment.
 
-        Never an attribute of this name of the repository's, whose word must not pass for these;
-        ``make_env`` warns of one. Behind a wrapper it is ``env.unwrapped.sandbox``; a
-        sub-environment's own attribute is ``env.envs[0].sandbox``.
+        This is never the repository's attribute of this name, whose claims must not be taken for
+        these; ``make_env`` warns if there is one. Behind a wrapper use ``env.unwrapped.sandbox``;
+        a sub-environment's own attribute is ``env.envs[0].sandbox``.
         """
         return SandboxView(self._session)
 
     def close(self, **kwargs: Any) -> None:
         """Close the sub-environments and end their processes, in bounded time. Idempotent.
 
-        Later requests are refused; of LeRobot's callers, ``reset`` and ``call`` open it again.
+        Later requests are refused, but for LeRobot ``reset`` and ``call`` open it again.
         """
         if self._requests.waiting not in (None, SENT) and not self.closed:
             warnings.warn(
@@ -476,11 +476,11 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         self._requests.show_warnings()
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Do nothing: ``close`` does all."""
+        """Do nothing, since ``close`` does everything."""
 
     @short_traceback
     def __getattr__(self, name: str) -> Any:
-        """An attribute that the repository's vector environment has beyond Gymnasium's."""
+        """An attribute of the repository's vector environment that Gymnasium's does not have."""
         manifest = self.__dict__.get("_manifest")
         # The manifest's names were checked, but Python also calls this method with the name of a
         # property of ours that raises AttributeError.
@@ -523,8 +523,8 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         return recipe.spec(self._manifest.suite, self._manifest.task, facts)
 
     def _apart(self) -> VectorApart | None:
-        """For libraries of single environments, whose infos are each one's own from now on; None
-        if the repository's own class joins them, or cannot be asked now.
+        """Have infos come apart from now on, for libraries of single environments. Returns None if
+        a repository's own class joins them, or if the worker cannot be asked now.
         """
         if not self._manifest.shardable:
             return None
@@ -535,7 +535,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
 
 def serve_lerobot(env: SandboxVectorEnv) -> None:
-    """Do as LeRobot's lazy environments do: ``reset`` after ``close`` opens it again, and
+    """Behave as LeRobot's lazy environments: ``reset`` after ``close`` opens it again, and
     ``render_fps`` is an integer.
     """
     env._session.repository.for_lerobot = True
@@ -549,13 +549,13 @@ def _one_for_lerobot(recipe: Recipe, suite: str, task: int | str) -> SandboxVect
 
 
 def leave_suite(env: SandboxVectorEnv) -> None:
-    """Have its first use start no other task of its suite, since ``EnvSuites.map`` does."""
+    """Have the first use start no other task of the suite, since ``EnvSuites.map`` starts them."""
     for prewarm in env._session.prewarms:
         prewarm.on_first_use(None, lambda: False)
 
 
 def refuse_limit(env: SandboxVectorEnv, steps: int | None) -> None:
-    """Raise ``ValueError`` for a limit of an episode's steps that is not the repository's own."""
+    """Raise ``ValueError`` if a limit of an episode's steps is not the repository's own."""
     own = env._spec_again(env._manifest.spec).max_episode_steps
     if steps not in (None, own):
         raise ValueError(
@@ -565,9 +565,10 @@ def refuse_limit(env: SandboxVectorEnv, steps: int | None) -> None:
 
 
 def metadata_of(manifest: EnvManifest, *, whole: bool = False) -> dict[str, Any]:
-    """The metadata with Gymnasium's enum for the autoreset mode. Trust: the worker's words.
+    """The metadata, with Gymnasium's enum for the autoreset mode. Trust: values from the worker.
 
-    LeRobot writes videos with an integer ``render_fps``: 20.0 is one, 12.5 only with ``whole``.
+    LeRobot writes videos with an integer ``render_fps``: 20.0 becomes 20, and with ``whole`` 12.5
+    is rounded, too.
     """
     metadata = dict(manifest.metadata)
     rate = metadata.get("render_fps")
@@ -582,6 +583,6 @@ def metadata_of(manifest: EnvManifest, *, whole: bool = False) -> dict[str, Any]
 
 
 def _check_name(name: object) -> None:
-    """In Python's words; nothing was sent."""
+    """Raise ``TypeError``, with Python's text, if an attribute's name is not a string."""
     if not isinstance(name, str):
         raise TypeError(f"attribute name must be string, not '{type(name).__name__}'")
