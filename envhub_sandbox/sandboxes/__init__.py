@@ -1,1 +1,1 @@
-"""The places that a worker can run in: a file or folder each, and what each answers."""
+"""The sandboxes in which a worker can run, one file for each; extras have further ones."""

@@ -1,4 +1,4 @@
-"""``sandbox=None``: the repository's code in the caller's own process, exactly as LeRobot does.
+"""``sandbox=None``: runs the repository's code in the caller's process, exactly as LeRobot does.
 
 Nothing protects the caller here, but the files come from a verified snapshot. Followed:
 ``lerobot.envs.utils._download_hub_file``, ``_import_hub_module``, ``_call_make_env`` and
@@ -18,7 +18,7 @@ from envhub_sandbox.hub.snapshot import Snapshot
 
 
 def refusal(reference: str) -> RuntimeError:
-    """LeRobot's refusal, in LeRobot's words."""
+    """The error for a missing ``trust_remote_code``, with LeRobot's text."""
     return RuntimeError(
         f"Refusing to execute remote code from the Hub for '{reference}'. "
         "Executing hub env modules runs arbitrary Python code from third-party repositories. "
@@ -32,7 +32,7 @@ def refusal(reference: str) -> RuntimeError:
 def make(
     snapshot: Snapshot, n_envs: int, use_async_envs: bool, cfg: Any, env_kwargs: dict[str, Any]
 ) -> dict[str, dict[Any, Any]]:
-    """Import the entry file here and call its ``make_env``."""
+    """Import the entry file in this process, call its ``make_env``, and return its suites."""
     make_env = getattr(_import(snapshot), "make_env", None)
     if make_env is None:
         raise LoadError(
@@ -51,8 +51,8 @@ def _import(snapshot: Snapshot) -> Any:
     if spec is None or spec.loader is None:
         raise LoadError(f"{snapshot.repo_id}:{snapshot.path} cannot be imported")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses with postponed annotations look it up
-    # root could write it into the store, where the next use would find an extra file
+    sys.modules[name] = module  # dataclasses with postponed annotations look the module up there
+    # root could write bytecode into the store, where the next use would find an extra file
     before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
         spec.loader.exec_module(module)

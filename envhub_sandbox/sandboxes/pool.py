@@ -1,19 +1,19 @@
-"""The worker servers of this process: started for the first user, given up by the last.
+"""The worker servers of this process: each starts for its first use and ends after its last.
 
-An unused server is ended, or kept for a while if its last user asked for that: a caller
-who closes one environment often opens another. ``ServerHold`` keeps one for a whole suite.
+If its last user asked for it, an unused server is kept for a while, because a caller who closes
+one environment often opens another. ``ServerHold`` keeps a server for a whole suite.
 
-Interrupts, finalizers, threads and forks come between any two statements (interruption.md):
+Interrupts, finalizers, threads and forks may come between any two statements (interruption.md):
 
-- The users of a server are its live uses: a Ctrl-C could falsify a count (rule 8). The finalizer of
-  a use that was noted nowhere gives it back (rule 5).
+- A server is in use while one of its uses is live. It has no count, which a Ctrl-C could falsify
+  (rule 8). If a use was noted nowhere, its finalizer gives it back (rule 5).
 - Giving a use back clears ``live`` first and sets ``_done`` last. The steps between are repeatable,
-  so ``release`` can be called until it comes through (rule 7).
+  so ``release`` can be called until it completes (rule 7).
 - The lock is reentrant: the garbage collector may close an environment in the middle of
   ``acquire``, and a signal handler in the middle of anything (rule 12).
 - Servers are started and ended outside of the lock, so that callers with other servers do not wait.
-  Each server has a lock for its start, for callers who want the same one.
-- A fork sees its parent's servers under another pid, and leaves them alone.
+  Each server has a lock for its start, for callers who want the same server.
+- A fork sees its parent's servers under another pid, and does not touch them.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class WorkerServer(ABC):
     """A running worker server.
 
     Attributes:
-        process_fd: A descriptor that becomes readable when it ends.
-        fd_path: The socket that takes descriptors, or None where memory cannot be shared.
-        layers: What confines the server itself, with all of its jails, one mapping a layer:
+        process_fd: A descriptor that becomes readable when the server ends.
+        fd_path: The socket that takes descriptors, or None if memory cannot be shared.
+        layers: The layers that confine the server itself and all of its jails, a mapping for each:
             ``layer``, ``enforced``, ``detail``.
-        silent_s: When it last failed to answer the end of a jail, by the monotonic clock.
-        far: The keys, if it is on another host and sees no file of this one.
+        silent_s: The time, by the monotonic clock, when it last did not answer the end of a jail.
+        far: The keys of a server on another host, which sees no file of this one; else None.
         uploading: Held during an upload to a server on another host.
-        is_ours: Whether we started it, and will end it.
+        is_ours: Whether this process started it, and will end it.
     """
 
     endpoint: str
@@ -64,11 +64,11 @@ class WorkerServer(ABC):
     @property
     @abstractmethod
     def runs(self) -> bool:
-        """Whether it has not ended, and can be reached."""
+        """Whether the server runs and can be reached."""
 
     @abstractmethod
     def stop(self) -> None:
-        """End it and everything below it, in bounded time. A fork of its owner does nothing.
+        """End the server and all of its jails, in bounded time. A fork of its owner does nothing.
 
         Idempotent. If interrupted, the next call finishes the work: interruption.md, rules 7, 14.
         """
@@ -79,7 +79,7 @@ S_co = TypeVar("S_co", bound=WorkerServer, covariant=True)
 
 
 class _Entry(Generic[S_co]):
-    """A server, its uses, and until when to keep it after them; None until this process ends."""
+    """A server, its uses, and how long to keep it after them (None: until this process ends)."""
 
     def __init__(self, key: Hashable, server: S_co) -> None:
         self.pid = os.getpid()
@@ -90,7 +90,7 @@ class _Entry(Generic[S_co]):
         self._uses: list[weakref.ref[ServerUse[Any]]] = []
 
     def uses(self) -> list[ServerUse[Any]]:
-        """The uses that have not been given back."""
+        """The live uses, which were not given back."""
         live = (ref() for ref in self._uses)
         return [use for use in live if use is not None and use.live]
 
@@ -100,8 +100,8 @@ class _Entry(Generic[S_co]):
 
 
 class ServerUse(Generic[S_co]):
-    """One use of a server. It ends once: when it is given back, or collected as garbage.
-    ``live``: whether it has not been given back.
+    """One use of a server. It ends when it is given back or collected as garbage.
+    ``live``: whether the use was not given back yet.
     """
 
     _done = True  # until there is something to give back
@@ -118,7 +118,7 @@ class ServerUse(Generic[S_co]):
         return len(self._entry.uses())
 
     def release(self) -> None:
-        """Give the use back, and with the last one the server. Idempotent.
+        """Give the use back; the last use also gives up the server. Idempotent.
 
         After an interrupt, the next call finishes the work. A fork does nothing: a thread that
         does not exist there may hold the lock.
@@ -137,14 +137,14 @@ _Place = tuple[int, Hashable, Hashable]
 class ServerPool(Generic[S]):
     """The servers of one kind. Thread-safe; a fork starts its own.
 
-    One unused server is kept at most: with a further one, the time of the one before has come. A
-    daemon thread ends them, and exists only while there is something to wait for; at the end of
-    the process all are ended at once.
+    At most one unused server is kept: a further unused server ends the earlier one. A daemon thread
+    ends idle servers in time, and exists only while some have a time; at the exit of the process
+    all servers are ended at once.
     """
 
     def __init__(self) -> None:
         self._changed = threading.Condition(threading.RLock())
-        # who wants a server that is being started waits for its lock: interruption.md, rule 12
+        # a caller who wants a server that is starting waits for its lock: interruption.md, rule 12
         self._starts: weakref.WeakValueDictionary[_Place, threading.RLock]
         self._starts = weakref.WeakValueDictionary()
         self._used: dict[_Place, _Entry[S]] = {}
@@ -160,11 +160,15 @@ class ServerPool(Generic[S]):
         idle_s: float | None = 0.0,
         group: Hashable = None,
     ) -> ServerUse[S]:
-        """A use of the server with this key; ``start`` starts one if none runs.
-        ``idle_s``: how long to keep it after its last use, if this is it; None until this process
+        """Return a use of the server with this key; ``start`` starts the server if none runs.
+        ``idle_s``: how long to keep the server if this is its last use; None: until this process
         ends.
-        ``group``: who shares it. Another group gets it only while it is unused.
+        ``group``: the users who share the server; another group gets it only while it is unused.
         """
+        # The lock of this start is held throughout, so a second caller waits and then finds the
+        # entry. ``_changed`` is held only around the tables and never around ``start``, which takes
+        # long. A use is made before the entry is judged or noted, so that no other thread ends the
+        # server in between.
         slot = os.getpid(), key, group
         with self._changed:
             starting = self._starts.setdefault(slot, threading.RLock())
@@ -173,7 +177,7 @@ class ServerPool(Generic[S]):
                 entry = self._used.get(slot)
                 if entry is not None:
                     use = ServerUse(self, entry, idle_s)
-                    # the garbage collector may just have closed the one environment that used it
+                    # the garbage collector may just have closed the last environment that used it
                     if self._used.get(slot) is entry and entry.server.runs:
                         return use
                     use.release()
@@ -186,11 +190,11 @@ class ServerPool(Generic[S]):
                 return use
 
     def give_back(self, use: ServerUse[S], entry: _Entry[S], idle_s: float | None) -> bool:
-        """End a use, or finish an interrupted end; True when done. For ``ServerUse`` alone."""
+        """End a use, or complete an interrupted end; returns True. Only ``ServerUse`` calls it."""
         with self._changed:
             use.live = False
             if entry.uses():
-                return True  # the last of them gives the server up
+                return True  # the last of these uses gives the server up
             slot = entry.pid, entry.key, entry.group
             if self._used.get(slot) is entry:
                 del self._used[slot]
@@ -206,12 +210,12 @@ class ServerPool(Generic[S]):
         for other in self._mine():
             other.until = 0.0
         entry.until = until
-        if entry not in self._idle:  # else an interrupted release has put it there
+        if entry not in self._idle:  # an interrupted release may have added it
             self._idle.append(entry)
         self._watch()
 
     def _take(self, key: Hashable) -> _Entry[S] | None:
-        """Take an idle server with this key; one that has died is ended soon."""
+        """Take an idle server with this key, or None; the thread ends one that has died."""
         for entry in self._mine():
             if entry.key == key:
                 if entry.server.runs:
@@ -234,7 +238,7 @@ class ServerPool(Generic[S]):
         if self._thread is None and self._earliest() is not None:
             thread = threading.Thread(target=self._run, name="envhub-idle", daemon=True)
             thread.start()
-            # interruption.md, rule 4: one that a Ctrl-C kept from starting is not joined
+            # interruption.md, rule 4: noted after its start, so a Ctrl-C leaves none to be joined
             self._thread = thread
 
     # --- ending servers --------------------------------------------------------------------------
@@ -245,11 +249,11 @@ class ServerPool(Generic[S]):
                 server.stop()
             except BaseException:
                 with self._changed:
-                    self._thread = None  # the next one gets a thread of its own
+                    self._thread = None  # the next server gets a new thread
                 raise
 
     def _due(self) -> S | None:
-        """Wait for the next idle server to end; None, which ends the thread, if none is timed."""
+        """Wait until an idle server is to end, and return it; None ends the thread."""
         with self._changed:
             while (earliest := self._earliest()) is not None:
                 until, entry = earliest
@@ -262,11 +266,11 @@ class ServerPool(Generic[S]):
             return None
 
     def stop_idle(self) -> None:
-        """End idle servers now, and wait for those that are ending."""
+        """End idle servers now, and wait for servers that are ending already."""
         self._stop(used=False)
 
     def stop_all(self) -> None:
-        """End all servers of this process, and keep none from now on: at its exit."""
+        """End all servers of this process and keep none from now on; called at its exit."""
         self._ends = True
         self._stop(used=True)
 
@@ -288,21 +292,21 @@ class ServerPool(Generic[S]):
                 stack.callback(entry.server.stop)
 
     def forked(self) -> None:
-        """In a fork, drop locks and threads of the parent: interruption.md, rule 14."""
+        """In a fork, replace the parent's locks and thread: interruption.md, rule 14."""
         self._changed = threading.Condition(threading.RLock())
         self._starts.clear()
         self._thread = None
 
 
 class ServerHold:
-    """Keeps a server from the first jail on until the last environment is closed. Thread-safe.
+    """Keeps a server from the first jail until the last environment is closed. Thread-safe.
 
-    An evaluation closes each task before it opens the next, and may think in between for longer
-    than an idle server is kept. Nor does it wait for each jail's end: that takes some 20 ms, for
-    the kernel has to take memory and mounts away. So closing one environment of several only asks
-    for the end, and who closes the next one waits for it, or who closes the last.
-    ``on_enter``: called when there is one environment more.
-    ``on_empty``: called when the last one is closed; where that is interrupted, again.
+    An evaluation closes each task before it opens the next, and may compute in between for longer
+    than an idle server is kept. It also need not wait for the end of each jail, which takes some
+    20 ms because the kernel has to remove memory and mounts. So closing one environment of several
+    only asks for the end of its jail; the next close waits for that end.
+    ``on_enter``: called when an environment is added.
+    ``on_empty``: called when the last environment is closed, and again after an interrupt.
     """
 
     def __init__(
@@ -320,8 +324,8 @@ class ServerHold:
         self._open: set[object] = set()
         self._use: ServerUse[Any] | None = None
         self._left: list[ServerUse[Any]] = []
-        # without the lock, since waits may be added while one is waited for: a list is enough, as
-        # what one caller has taken from it no other waits for
+        # A list without the lock: other threads may append while one waits, and each takes its
+        # waits out of the list.
         self._pending_closes: list[Callable[[], None]] = []
 
     def enter(self) -> Callable[[], None]:
@@ -338,13 +342,13 @@ class ServerHold:
             if not self._open or self._is_kept(used):
                 return
             use = self._acquire()
-            if self._use is not None:  # its server has died
+            if self._use is not None:  # the server of this use has died
                 self._left.append(self._use)
             self._use = use
         self._let_go()
 
     def close_later(self, server: WorkerServer, wait: Callable[[], None]) -> bool:
-        """Let the next close wait for the end of this jail; False if this is the last close.
+        """Leave the wait for the end of a jail to the next close; False if this is the last close.
 
         Waits for jails that were deferred earlier; most have ended by now.
         """
@@ -356,7 +360,7 @@ class ServerHold:
         return True
 
     def settle(self) -> bool:
-        """Wait for jails that are ending; whether there was one."""
+        """Wait for jails that are ending; returns whether there were any."""
         settled = False
         while self._pending_closes:
             try:
@@ -374,7 +378,9 @@ class ServerHold:
     def _leave(self, ticket: object) -> None:
         """Remove an environment; an interrupted call can be repeated: interruption.md, rule 7."""
         if not self._owner.is_here:
-            return  # a fork: the server is the parent's, and another thread may have held the lock
+            return  # a fork: the server is the parent's, and the lock may be held for ever
+        # Each step can be repeated: the use moves to ``_left`` under the lock, then deferred jails
+        # end, then the uses in ``_left`` are released, and ``on_empty`` comes last.
         with self._lock:
             self._open.discard(ticket)
             if not self._open and self._use is not None:
@@ -401,7 +407,7 @@ _pools: weakref.WeakSet[ServerPool[Any]] = weakref.WeakSet()
 
 
 def stop_idle() -> None:
-    """End the unused servers of this process, of every kind."""
+    """End the unused servers of this process, in all pools."""
     with contextlib.ExitStack() as stack:  # interruption.md, rule 9
         for pool in list(_pools):
             stack.callback(pool.stop_idle)

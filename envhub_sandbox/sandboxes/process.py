@@ -1,12 +1,12 @@
-"""``sandbox="process"``: the worker server as a child process on this machine, and its folder.
+"""``sandbox="process"``: runs the worker server as a child process, with a folder of its own.
 
-One server serves all environments of this process, with a warm zygote. It is a fresh interpreter
-with its own environment variables and descriptors, and ends when this process does, of which it
-holds a pidfd. ``LocalServer`` is any server that is our child, also in a container.
+One server with a warm zygote serves all environments of this process. It is a new interpreter with
+environment variables and descriptors of its own. It holds a pidfd of this process and ends when
+this process ends. ``LocalServer`` is any server that is our child, also in a container.
 
-Each has a private folder with its sockets, whose paths have at most 107 bytes. Its client locks a
-file in it for as long as it lives, so that others can remove the folder of a client that was
-killed. Containers name such a folder.
+Each server has a private folder with its sockets, whose paths have at most 107 bytes. The client
+locks a file in the folder while it lives, so that others can remove the folder of a client that was
+killed.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ _BEGUN = {f".{_CLIENT_FILE}", f".{_LOCK_FILE}"}
 _SOCKET_BYTES = 107
 _LONGEST = f"/{CONTAINER}12345678/sockets/server"
 _EMPTY_S = 60.0
-"""A client needs less time between making a folder and the first file in it."""
+"""A folder that is empty for longer was left by a client that was killed."""
 
 
 def worker_program(*arguments: str) -> list[str]:
@@ -70,11 +70,11 @@ def worker_program(*arguments: str) -> list[str]:
 
 
 class LocalServer(WorkerServer):
-    """A worker server that we start.
+    """A worker server that this process starts as a child.
     ``prefix``: the beginning of its folder's name.
-    ``sockets``: the part of the folder where its sockets lie.
+    ``sockets``: the folder of its sockets, relative to its folder.
     ``stop_s``: how long its process may take to end.
-    ``process``: the server, or the monitor of its container.
+    ``process``: the server's process, or the monitor of its container.
     """
 
     fd_path: str
@@ -93,19 +93,19 @@ class LocalServer(WorkerServer):
 
     @property
     def folder(self) -> Path:
-        """Where its sockets and its log lie."""
+        """The folder with its sockets and its log."""
         return self._runtime.path
 
     @property
     def process(self) -> subprocess.Popen[bytes]:
-        """The child that was started."""
+        """The child process."""
         assert self._process is not None
         return self._process
 
     @contextlib.contextmanager
     def starting(self, start: Callable[[int], subprocess.Popen[bytes]]) -> Iterator[int]:
-        """Start the process; gives the pipe on which it says that it is ready. A failure ends it.
-        ``start``: starts it, given the end of the pipe that it writes to.
+        """Start the process; yields the pipe on which it says that it is ready. A failure ends it.
+        ``start``: starts the process, which writes to the end of the pipe that it is given.
         """
         try:
             ready, ready_end = os.pipe()
@@ -125,16 +125,16 @@ class LocalServer(WorkerServer):
 
     @property
     def runs(self) -> bool:
-        """Whether it has not ended, and can be reached.
+        """Whether the server runs and can be reached.
 
-        A killed server is a zombie until its threads are gone, and can only then be waited for.
-        Nobody can connect if a cleaner of temporary files has removed its sockets.
+        A killed server is a zombie, which can be reaped only when its threads have ended. If a
+        cleaner of temporary files has removed its sockets, nobody can connect.
         """
         alive = self.process.poll() is None and not has_ended(self.process.pid)
         return alive and self._runtime.has_sockets(*self._sockets)
 
     def stop(self) -> None:
-        """See ``WorkerServer``, and interruption.md, rule 7."""
+        """End the server and remove its folder; interruption.md, rule 7."""
         if self.stopped or not self._owner.is_here:
             return
         if self._process is not None:
@@ -142,19 +142,19 @@ class LocalServer(WorkerServer):
             try:
                 self._process.wait(self._stop_s)
             except subprocess.TimeoutExpired:
-                self._process.kill()  # of a container's monitor: its pipe closes, which ends it
+                self._process.kill()  # a container ends when its monitor's pipe closes
                 self._process.wait()
-        self._runtime.remove()  # also where a container's monitor was killed itself
+        self._runtime.remove()  # a killed monitor of a container has not removed it
         with contextlib.suppress(OSError):
-            self.stopped = True  # once: the number may be somebody else's a moment later
+            self.stopped = True  # before close: closing twice could close another file's number
             os.close(self.process_fd)
 
     def __del__(self) -> None:
-        self.stop()  # interruption.md, rule 5: a start was interrupted before it was noted
+        self.stop()  # interruption.md, rule 5: a Ctrl-C may come before the server is noted
 
 
 class ProcessSandbox(Sandbox):
-    """Workers on this machine, confined by the kernel."""
+    """Runs workers on this machine, confined by the kernel."""
 
     name = "process"
     is_here = True
@@ -163,19 +163,19 @@ class ProcessSandbox(Sandbox):
         self._pool: ServerPool[LocalServer] = ServerPool()
 
     def package_target(self) -> Any:
-        """Packages are made for the interpreters of this machine."""
+        """The target that makes packages for the interpreters of this machine."""
         return extras.find("envhub_sandbox.extras.packages.packages", "HERE")
 
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
     ) -> ServerUse[LocalServer]:
-        """The server for this process, started if there is none."""
+        """Use the server of this process; start it if there is none."""
         check_platform()
         return self._pool.acquire(store, partial(_start, store, runtime), idle_s)
 
 
 def check_platform() -> None:
-    """Raise ``SandboxUnavailableError``: nothing of this platform can confine a process."""
+    """Raise ``SandboxUnavailableError`` if this platform cannot confine a process."""
     if not IS_LINUX:
         raise SandboxUnavailableError(
             f"{option_name('sandbox', 'process')} needs Linux, and this is {NAME}, where nothing "
@@ -187,11 +187,12 @@ def check_platform() -> None:
 
 
 def _start(store: Path, runtime: Runtime) -> LocalServer:
-    # The order matters. Until the server is ready there is nothing to do, so what takes time and is
-    # not needed before belongs here, where it is free: that is why nothing which `make_env` imports
-    # imports ZeroMQ, or what speaks it: `session` imports that where it is used. The import has a
-    # thread, which a Ctrl-C does not reach: an import of ZeroMQ that was interrupted can never be
-    # repeated. Whatever fails here, or interrupts it, ends the server.
+    # The order matters. Until the server is ready this process only waits, so slow work that is
+    # not needed earlier costs nothing here: the import of ZeroMQ, and removing stale folders. That
+    # is why no module that `make_env` imports may import ZeroMQ or `transport.connection`;
+    # `session` imports them where it uses them. The import runs in a thread, where a Ctrl-C does
+    # not reach it, because an interrupted import of ZeroMQ can never be repeated. Any failure or
+    # interrupt here ends the server.
     importing = threading.Thread(target=_import_quietly, name="envhub-import", daemon=True)
     server = LocalServer(SERVER, "", _STOP_S)
     with server.starting(partial(_execute, server, store, runtime)) as ready:
@@ -204,12 +205,12 @@ def _start(store: Path, runtime: Runtime) -> LocalServer:
 
 
 def _import_quietly() -> None:
-    with contextlib.suppress(Exception):  # it is raised where it is imported again
+    with contextlib.suppress(Exception):  # the second import raises the error
         _import_transport()
 
 
 def _import_transport() -> None:
-    """Import all that speaks with a server: these two import the rest."""
+    """Import all modules that speak with a server; these two import the others."""
     from envhub_sandbox.transport.shared_memory import attachment, lane  # noqa: F401
 
 
@@ -237,7 +238,7 @@ def _execute(
 
 def _environment() -> dict[str, str]:
     kept = {name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ}
-    # it computes nothing, and idle threads of OpenBLAS spin at first
+    # one thread: the server computes nothing, and idle threads of OpenBLAS spin at first
     return {**kept, "OPENBLAS_NUM_THREADS": "1"}
 
 
@@ -257,8 +258,8 @@ PROCESS = ProcessSandbox()
 
 
 class RuntimeFolder:
-    """A new private folder, which is in use as long as this process lives.
-    Raises ``SandboxUnavailableError``: there is no place for one.
+    """A new private folder, which is locked while this process lives.
+    Raises ``SandboxUnavailableError``: no folder can be made.
     """
 
     def __init__(self, prefix: str) -> None:
@@ -270,17 +271,17 @@ class RuntimeFolder:
             raise
 
     def has_sockets(self, *names: str) -> bool:
-        """Whether all of these are there: others may remove temporary files that look old."""
+        """Whether all these sockets exist; a cleaner may remove temporary files that look old."""
         return all((self.path / name).is_socket() for name in names)
 
     def remove(self) -> None:
-        """Remove it, with all that is in it. Idempotent."""
+        """Remove the folder and its contents. Idempotent."""
         self._lock.release()  # first: Windows removes no file that is open
         shutil.rmtree(self.path, ignore_errors=True)
 
 
 def _made(prefix: str) -> Path:
-    """A new folder in the first of the ``places`` where one can be made."""
+    """Make a folder in the first of the ``places`` that permits it."""
     why = ""
     for parent in places():
         if _is_short(parent):
@@ -296,24 +297,24 @@ def _made(prefix: str) -> Path:
 
 
 def places() -> list[Path]:
-    """Where runtime folders may lie, best first; sockets need a short path."""
+    """The parent folders for runtime folders, best first; sockets need a short path."""
     parents = []
-    with contextlib.suppress(FileNotFoundError):  # nothing can be written here
+    with contextlib.suppress(FileNotFoundError):  # no temporary folder can be written
         parents.append(Path(tempfile.gettempdir()))
     own = os.environ.get("XDG_RUNTIME_DIR", "")
-    if os.path.isabs(own) and user_id() != 0:  # root's jails, another user, have to get through
+    if os.path.isabs(own) and user_id() != 0:  # root's jails are another user
         parents.append(Path(own))
     return list(dict.fromkeys([*parents, *([] if IS_WINDOWS else [Path("/tmp")])]))
 
 
 def _is_short(folder: Path) -> bool:
-    if not IS_LINUX:  # there it holds no sockets
+    if not IS_LINUX:  # the folder has no sockets there
         return True
     return len(os.fsencode(folder) + os.fsencode(_LONGEST)) <= _SOCKET_BYTES
 
 
 def stale_folders(parent: Path) -> Iterator[Path]:
-    """Our folders below ``parent`` whose client, or server without a client, has ended."""
+    """Our folders in ``parent`` whose client (or server, if it has no client) has ended."""
     for path in sorted(parent.glob(f"{SERVER}*")):
         with contextlib.suppress(OSError):
             if _NAME.fullmatch(path.name) and _belongs_to_us(path) and _is_deserted(path):
@@ -323,7 +324,7 @@ def stale_folders(parent: Path) -> Iterator[Path]:
 def remove_stale() -> list[Path]:
     """Remove stale folders that this machine made since it booted; returns them.
 
-    Others are left for people to judge: a shared file system may not pass locks on.
+    Folders of other machines stay: a shared file system may not share locks.
     """
     folders = [path for parent in places() for path in stale_folders(parent)]
     ours = [path for path in folders if not _is_elsewhere(path)]
@@ -334,8 +335,8 @@ def remove_stale() -> list[Path]:
 
 
 def is_in_use(path: Path) -> bool:
-    """Whether the client of a folder lives.
-    Raises ``FileNotFoundError``: it is no folder of a client here; ``OSError``: it is not known.
+    """Whether the client of a runtime folder lives.
+    Raises ``FileNotFoundError``: it is not a client's folder; ``OSError``: the lock is unknown.
     """
     if not (path.is_absolute() and _NAME.fullmatch(path.name)):
         raise FileNotFoundError(errno.ENOENT, "it is no runtime folder", str(path))
@@ -359,5 +360,5 @@ def _is_deserted(path: Path) -> bool:
     for name in (_CLIENT_FILE, _LOCK_FILE):
         if name in names:
             return not is_held(path / name)
-    # its client was killed before its first file had that name
+    # the client was killed before its first file had its final name
     return names <= _BEGUN and time.time() - path.stat().st_mtime > _EMPTY_S

@@ -1,6 +1,6 @@
-"""A place for workers: what ``make_env`` asks of each, with what most of them answer.
+"""The base class of sandboxes, in which workers run, with the methods that most of them share.
 
-Also what is done where one has no room: whether another is tried, and whether to ask it again.
+Also the rules for a server without room: whether to try another server, and whether to retry.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ _AGAIN_S = 1.0
 
 
 def is_list(text: str) -> bool:
-    """Whether a text names several places."""
+    """Whether a text names several sandboxes."""
     return "," in text
 
 
 class Sandbox:
-    """A place for workers. Each overrides ``acquire`` or ``for_repository``, and what differs.
+    """A kind of place where workers run. A subclass overrides ``acquire`` or ``for_repository``.
 
     Attributes:
-        name: How errors call it.
+        name: Its name in errors.
         is_here: Whether jails run on this machine and see its files.
-        retry_s: How long to wait for room in a place that is shared with others.
+        retry_s: How long to wait for room on a server that others use, too.
     """
 
     name: str
@@ -57,69 +57,69 @@ class Sandbox:
     def for_repository(
         self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
     ) -> Sandbox:
-        """The place for one repository, whose server sees no other's files; starts nothing.
+        """The sandbox for one repository, whose server sees no other files. Starts nothing.
         ``runtime``: the interpreter that the caller named, if any, and the repository's packages.
-        ``assets``: verified files of further repositories that its jails see.
-        Raises ``PolicyError``: the place cannot permit what the policy does;
-        ``SandboxUnavailableError``: there is no such place here.
+        ``assets``: verified files of further repositories that its jails can read.
+        Raises ``PolicyError``: the sandbox cannot permit what the policy permits;
+        ``SandboxUnavailableError``: this machine lacks this sandbox.
         """
         return self
 
     def workers(self, num_workers: int | None) -> Sequence[Sandbox]:
-        """The places of an environment's workers, each with a jail of its own. In most places it
-        is one jail with ``num_workers`` processes."""
+        """The sandboxes of an environment's workers, each with a jail of its own. Most sandboxes
+        have one jail with ``num_workers`` processes."""
         return [self]
 
     @property
     def address(self) -> str:
-        """Where it is, as far as that says more than its name."""
+        """Its address if it has one, else its name."""
         return self.name
 
     def note_interpreter(self, runtime: Runtime) -> None:
-        """Note the interpreter of this machine that the caller named, before all else."""
+        """Note the interpreter of this machine that the caller named, before any other call."""
 
     def candidates(self) -> Iterator[Sandbox]:
-        """The places where a jail may be opened, in the order in which to try them."""
+        """The sandboxes in which a jail may be opened, in the order to try them."""
         yield self
 
     def runs_on(self, runtime: Runtime) -> Runtime:
-        """What runs the repository there; a remembered manifest holds for this only."""
+        """The interpreter and packages there; a remembered manifest holds only for these."""
         return runtime
 
     def package_target(self) -> Any:
-        """A ``PackageTarget`` of ``extras.packages``, which makes a repository's own packages for
-        what runs there; None where nothing can.
+        """The ``PackageTarget`` of ``extras.packages`` that makes a repository's own packages for
+        this sandbox; None if there is none.
 
-        Asks the place nothing before it has to make some.
+        It asks the server nothing before it has to make packages.
         """
         return None
 
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
     ) -> ServerUse[WorkerServer]:
-        """Use a server, which is shared, that may show snapshots below ``store`` to jails.
-        ``runtime``: a hint on what its first jail runs on.
+        """Use a shared server, whose jails may read snapshots below ``store``.
+        ``runtime``: a hint on the interpreter and packages of its first jail.
         ``idle_s``: how long to keep the server after its last use; None while this process lives.
-        Raises ``SandboxUnavailableError``: there is no such place here; ``WorkerStartupError``: the
-        server did not come up.
+        Raises ``SandboxUnavailableError``: this machine lacks this sandbox;
+        ``WorkerStartupError``: the server did not start.
         """
         raise SandboxUnavailableError(f"{self.name}: a server is started for one repository only")
 
     def prepare(
         self, order: OpenJail, server: WorkerServer, client: WorkerConnection, deadline: Deadline
     ) -> OpenJail:
-        """The order for a jail as a server of this place understands it.
-        ``order``: in terms of this machine.
-        ``deadline``: for what has to be brought there first.
-        Raises ``WorkerError``: the server does not take it.
+        """Convert the order for a jail to the terms of this sandbox's server.
+        ``order``: the order in terms of this machine.
+        ``deadline``: bounds uploads to the server.
+        Raises ``WorkerError``: the server refuses.
         """
         return order
 
 
 def may_go_elsewhere(error: EnvHubError) -> bool:
-    """Whether to try another place, since this one has no room or cannot be reached.
+    """Whether to try another server, since this one has no room or cannot be reached.
 
-    A repository would fail elsewhere too, and a refused key is a mistake to report.
+    An error of the repository would be the same elsewhere, and a refused key has to be reported.
     """
     if isinstance(error, WorkerDiedError):
         return error.reason in ("connection", "server")
@@ -129,9 +129,9 @@ def may_go_elsewhere(error: EnvHubError) -> bool:
 
 
 def worst_of(failures: Sequence[EnvHubError]) -> EnvHubError:
-    """The error for a worker that no place takes: one that may pass first; the text has all.
+    """The error for a worker that no server takes: preferably a temporary one, with all texts.
 
-    ``failures``: at least one, in the order of the tries.
+    ``failures``: the error of each try, in order; at least one.
     """
     busy = (failure for failure in failures if isinstance(failure, ServerBusyError))
     error = next(busy, failures[0])
@@ -149,12 +149,12 @@ def retry_while_busy(
     label: str,
     refusal: EnvHubError | None = None,
 ) -> T:
-    """Ask again as long as there is no room.
+    """Ask again while the server has no room.
 
-    A server serves those who ask again in their order, so the second try comes soon, to get a place
-    in the line. The time in the line does not count against the ``deadline``.
-    ``refusal``: the answer to an earlier try.
-    Raises ``ServerBusyError``: there was no room in all that time.
+    A server serves clients that ask again in their order, so the second try comes soon, to get a
+    place in the queue. The time in the queue does not count against the ``deadline``.
+    ``refusal``: the error of an earlier try.
+    Raises ``ServerBusyError``: there was no room within ``retry_s``.
     """
     until, pause_s = monotonic() + retry_s, _SOON_S
     ends = refusal is not None and (is_draining(refusal) or is_unanswered(refusal))
@@ -179,7 +179,7 @@ def is_draining(error: EnvHubError) -> bool:
 
 
 def is_unanswered(error: EnvHubError) -> bool:
-    """Whether there was no answer, as in the moment between two servers."""
+    """Whether there was no answer, as while one server replaces another."""
     if isinstance(error, WorkerDiedError):
         return error.reason == "connection"
     return isinstance(error, UnreachableError)
