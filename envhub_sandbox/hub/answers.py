@@ -1,12 +1,12 @@
-"""What a Hub's answers may be before anything is done with them, and what its failures mean.
+"""Checks a Hub's answers before they are used, and explains its failures.
 
-Answers are bounded, and harmless as names: huggingface_hub makes paths of the headers ``ETag`` and
-``X-Repo-Commit``, and a Hub that lies in them would write files outside of the Hub cache. Sessions
-are those of requests (before 1.0) or httpx.
+Answers must be bounded, and headers must be harmless as file names: huggingface_hub makes paths of
+``ETag`` and ``X-Repo-Commit``, by which a hostile Hub could write files outside of the Hub cache.
+Sessions are of the library requests (before 1.0) or httpx.
 
-Failures are told in words that say what to do next. huggingface_hub 0.34 raises requests'
-exceptions, 1.x httpx's and 2.x httpx2's, often wrapped in ``LocalEntryNotFoundError``. So the chain
-of causes is walked, and transports are recognised by the names of their classes.
+The text of a failure says what to do next. huggingface_hub 0.34 raises exceptions of requests, 1.x
+of httpx and 2.x of httpx2, often wrapped in ``LocalEntryNotFoundError``. So ``explain`` walks the
+chain of causes, and recognises exceptions of transports by the names of their classes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.text import printable
 
 MAX_BODY_BYTES = 64 << 20
-"""Of a page of a listing, unpacked: those of the Hub have some 300 kB."""
+"""The most bytes of a page of a listing, unpacked; the Hub's pages have some 300 kB."""
 _MAX_BODY_S = 300.0
 _NAMES = {
     "ETag": r'(W/)?"?[A-Za-z0-9_+=:-][A-Za-z0-9_+=:.-]{0,199}"?',
@@ -34,7 +34,7 @@ _NAMES = {
 
 
 class HostileAnswerError(Exception):
-    """An answer that no Hub gives; the text says what is wrong with it."""
+    """An answer that no honest Hub gives; the text says what is wrong with it."""
 
 
 def streamed(session: Any, url: str, options: Mapping[str, Any]) -> Any:
@@ -60,9 +60,9 @@ def bounded_body(response: Any) -> bytes:
 
 @contextmanager
 def guarded(session: Any) -> Iterator[None]:
-    """While this lasts, the session takes no answer whose headers make hostile names.
+    """Within this context, have the session refuse answers whose headers make hostile names.
 
-    Others may use the session meanwhile, and their answers are judged, too.
+    Other threads may use the session meanwhile; their answers are checked, too.
     """
     of_httpx = hasattr(session, "event_hooks")
     hooks = (session.event_hooks if of_httpx else session.hooks).setdefault("response", [])
@@ -167,7 +167,7 @@ class Kind(Enum):
 
 
 ABSENT = frozenset({Kind.NO_REPOSITORY, Kind.NO_REVISION, Kind.NO_ENTRY})
-"""The repository is not there or not like this: one of another type may be."""
+"""The repository or file does not exist; there may be a repository of another type."""
 
 UNREACHABLE = frozenset(
     {
@@ -175,7 +175,7 @@ UNREACHABLE = frozenset(
         Kind.SERVER_ERROR,
     }
 )
-"""Nothing was learned about the repository: what the store has may still be what is wanted."""
+"""The request says nothing about the repository, so a commit in the store may still be valid."""
 
 
 class HubFailure(Exception):
@@ -204,7 +204,7 @@ def explain(
     revision: str | None,
     endpoint: str,
 ) -> HubFailure:
-    """The failure that an exception of the Hub client stands for."""
+    """Turn an exception of the Hub client into a failure with advice."""
     known_kinds = ((kind, link) for link in chain(error) if (kind := _kind_of(link)) is not None)
     kind, source = next(known_kinds, (Kind.OTHER, error))
     response = getattr(source, "response", None)
@@ -225,7 +225,7 @@ def explain(
 
 
 def _reason(error: BaseException) -> str:
-    """The class, and what the system said: of all that wraps it the innermost that has a text."""
+    """The exception's class, and the text of the innermost system error in its chain."""
     texts = [str(link) for link in chain(error) if isinstance(link, OSError) and str(link)]
     text = _LOGIN.sub("***", printable([str(error), *texts][-1])[:_LONGEST_QUOTE])
     text = " ".join(text.split())
@@ -233,14 +233,14 @@ def _reason(error: BaseException) -> str:
 
 
 def redact(text: str, secrets: tuple[str, ...]) -> str:
-    """The text without the secrets, which a careless server may have echoed."""
+    """Replace secrets in a text, which a careless server may have echoed."""
     for secret in secrets:
         text = text.replace(secret, "***")
     return text
 
 
 def conceal(error: BaseException, secrets: tuple[str, ...]) -> None:
-    """Take the secrets out of the texts of an exception and its causes: tracebacks show them."""
+    """Replace secrets in the texts of an exception and its causes, which tracebacks show."""
     for link in chain(error):
         link.args = tuple(
             redact(value, secrets) if isinstance(value, str) else value for value in link.args
@@ -248,7 +248,7 @@ def conceal(error: BaseException, secrets: tuple[str, ...]) -> None:
 
 
 def chain(error: BaseException | None) -> Iterator[BaseException]:
-    """An exception, and what it came of."""
+    """Yield an exception and its chain of causes."""
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))
@@ -259,14 +259,14 @@ def chain(error: BaseException | None) -> Iterator[BaseException]:
 def _kind_of(error: BaseException) -> Kind | None:
     names = {cls.__name__ for cls in type(error).__mro__}
     if "LocalEntryNotFoundError" in names or "IncompleteSnapshotError" in names:
-        return None  # A wrapper: the reason is in its cause.
+        return None  # a wrapper: its cause has the reason
     for name, kind in _KIND_OF_CLASS:
         if name in names:
             return kind
     response = getattr(error, "response", None)
     status = getattr(response, "status_code", None)
     if status == 401 and _header(response, "X-Error-Message") != _BAD_TOKEN:
-        return Kind.NO_REPOSITORY  # What the Hub answers without a token for all it does not show.
+        return Kind.NO_REPOSITORY  # the Hub's answer, without a token, for anything that it hides
     if isinstance(status, int):
         return _KIND_OF_STATUS.get(status, Kind.SERVER_ERROR if status >= 500 else Kind.OTHER)
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -280,7 +280,7 @@ def _kind_of(error: BaseException) -> Kind | None:
     return Kind.UNREACHABLE if names & _TRANSPORT_CLASSES else None
 
 
-# Gated is a subclass of not found: first come the narrower ones.
+# Subclasses come before their base classes: a gated error is also a not-found error.
 _KIND_OF_CLASS = (
     ("GatedRepoError", Kind.GATED),
     ("DisabledRepoError", Kind.DISABLED),

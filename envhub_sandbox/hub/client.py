@@ -1,8 +1,8 @@
-"""The Hub, through huggingface_hub 0.34 to 2.x: resolve, list, download.
+"""A client of the Hub, by huggingface_hub 0.34 to 2.x: resolves, lists and downloads.
 
-The client library is imported inside the functions: a pinned snapshot that is in the store
-needs none of it. What it downloads lies in its own cache and is not trusted here: the caller
-compares every file with the listing.
+Functions import the library only when they need it, since a pinned snapshot in the store does not.
+The library downloads into its own cache, which is not trusted: the caller compares every file with
+the listing.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _LIBRARY = {"library_name": "envhub-sandbox"}
 _xet_switch = threading.Lock()
 _WORKERS = 8
 MAX_IDLE_PAGES = 1000
-"""Pages of a listing in a row without a file: folders alone can fill some."""
+"""The most pages of a listing in a row without a file; folders alone can fill some pages."""
 
 
 def default_endpoint() -> str:
@@ -80,7 +80,7 @@ def checked_endpoint(endpoint: str | None) -> str:
 
 
 def checked_token(token: str | bool | None) -> str | bool | None:
-    """The token, stripped; the text of an error never shows it. Raises ``HubReferenceError``."""
+    """Strip and check a token. Raises ``HubReferenceError``, whose text never shows the token."""
     if not isinstance(token, str):
         return token
     stripped = token.strip()
@@ -94,8 +94,8 @@ class HubClient:
     """One endpoint, one token, one Hub cache. Every method raises ``HubFailure``.
 
     Attributes:
-        endpoint: Without a trailing slash; a login in it goes into a header, and into no URL.
-        token: As in huggingface_hub: None for the stored one, False for none.
+        endpoint: The URL without a trailing slash; a login in it is sent as a header only.
+        token: As in huggingface_hub: None for the stored token, False for no token.
         cache_dir: huggingface_hub's ``cache_dir``; None for its default.
     """
 
@@ -109,7 +109,7 @@ class HubClient:
         return without_login(self.endpoint)
 
     def resolve(self, repo: Repository, revision: str | None) -> str:
-        """Ask which full commit a revision is; None is ``main``, as in huggingface_hub."""
+        """The full commit that a revision is now; None means ``main``, as in huggingface_hub."""
         with self._explained(repo, revision):
             commit = self._about(repo, revision or "main")["sha"]
             if not isinstance(commit, str) or not is_commit(commit):
@@ -117,12 +117,12 @@ class HubClient:
         return commit
 
     def changed(self, repo: Repository, commit: str) -> str:
-        """The day of a commit, as the Hub says it: ``"2024-05-31"``."""
+        """The day of a commit according to the Hub, such as ``"2024-05-31"``."""
         with self._explained(repo, commit):
             return str(self._about(repo, commit)["lastModified"])[:10]
 
     def is_public(self, repo: Repository, commit: str) -> bool:
-        """Whether everybody gets this commit, without a login. Raises nothing."""
+        """Whether the Hub gives this commit to everybody without a login. Never raises."""
         everybody = replace(self, endpoint=self.public_endpoint, token=False)
         try:
             with everybody._explained(repo, commit):
@@ -157,17 +157,17 @@ class HubClient:
 
     @contextmanager
     def files(self, repo: Repository, commit: str) -> Iterator[CommitFiles]:
-        """The files of a commit."""
+        """The listing of a commit's files, and the function that copies them."""
         yield CommitFiles(self.listing(repo, commit), partial(self._copier, repo, commit))
 
     def _copier(
         self, repo: Repository, commit: str, files: Sequence[FileRecord], title: str
     ) -> Copier:
-        """Bring the files into the Hub cache; what copies each from there, or anew from the Hub.
+        """Download files into the Hub cache; returns a function that copies each into the store.
 
-        One by one and not by ``snapshot_download``: that asks for a listing of its own, which may
-        be another than the one that was judged. Where one fails, or a Ctrl-C comes, those that run
-        are not waited for: all that they write is whole files of the Hub cache.
+        Files are downloaded one by one, because ``snapshot_download`` fetches a listing of its own,
+        which may differ from the checked one. After a failure or a Ctrl-C it does not wait for
+        running downloads, since they only write whole files into the Hub cache.
         """
         with self._explained(repo, commit):
             downloads = [partial(self._download, repo, commit, file.path) for file in files]
@@ -179,7 +179,7 @@ class HubClient:
                 copy_verified(folder / record.path, target, record)
                 return
             except HashMismatch:
-                # The Hub cache may hold an edited or half-written file: once more, from the Hub.
+                # the Hub cache may have an edited or incomplete file: download it again, once
                 target.unlink(missing_ok=True)
             with self._explained(repo, commit):
                 again = self._download(repo, commit, record.path, force_download=True)
@@ -204,7 +204,7 @@ class HubClient:
             **repo._asdict(),
             "revision": commit,
             "filename": path,
-            # Not every version expands "~" itself; one would make a folder of that name.
+            # not every version of the library expands "~" itself
             "cache_dir": None if self.cache_dir is None else os.path.expanduser(self.cache_dir),
             "token": token,
             "headers": headers,
@@ -212,12 +212,12 @@ class HubClient:
             **_LIBRARY,
             **more,
         }
-        # a session may be the thread's own
+        # in each download, because each thread may have a session of its own
         with guarded(import_module("huggingface_hub.utils").get_session()):
             return Path(_with_xet_or_without(hf_hub_download, **arguments))
 
     def _login(self) -> tuple[dict[str, str], str | bool | None]:
-        """The header of a login, which goes before a token, as in a URL; and the token."""
+        """The header of the endpoint's login, and the token; a login replaces the token."""
         login = login_of(self.endpoint)
         if login is None:
             return {}, self.token
@@ -227,8 +227,8 @@ class HubClient:
         return f"{self.public_endpoint}/api/{repo.repo_type}s/{repo.repo_id}"
 
     def _get(self, url: str, query: dict[str, str]) -> tuple[Any, str | None]:
-        """The JSON of an answer, and the address of the next page."""
-        # HfApi.list_repo_tree has no timeout, and in 2.x retries a broken Hub for 24 s.
+        """GET a URL; returns the answer's JSON and the URL of the next page, if any."""
+        # not HfApi.list_repo_tree: it has no timeout, and in 2.x retries a broken Hub for 24 s
         client: Any = import_module("huggingface_hub.utils")
         timeout = import_module("huggingface_hub.constants").HF_HUB_ETAG_TIMEOUT
         options = {"headers": self._headers(), "params": query, "timeout": timeout}
@@ -252,7 +252,7 @@ class HubClient:
         except SnapshotError:
             raise
         except Exception as error:
-            # before it becomes the cause of an error of ours, which tracebacks show
+            # first: the exception becomes the cause of ours, and tracebacks show its text
             secrets = self._secrets()
             conceal(error, secrets)
             hostile = [link for link in chain(error) if isinstance(link, HostileAnswerError)]
@@ -275,7 +275,7 @@ class HubClient:
 
 
 def _next_page(url: str | None, query: dict[str, str]) -> dict[str, str] | None:
-    """The next page's query. Only that: a link to another host would take the token along."""
+    """The query of the next page. Its host is ignored, or a link could send the token elsewhere."""
     if url is None:
         return None
     following = dict(parse_qsl(urlsplit(url).query))
@@ -296,7 +296,7 @@ def _record_of(item: Any, repo: Repository) -> FileRecord | None:
             and size >= 0
             and re.fullmatch(rf"[0-9a-f]{{{length}}}", digest)
         ):
-            path.encode()  # A lone surrogate cannot be a file's name.
+            path.encode()  # raises for a lone surrogate, which cannot be in a file's name
             return FileRecord(path, size, f"{kind}:{digest}")
         raise ValueError("a field is not what it should be")
     except (KeyError, TypeError, AttributeError, ValueError) as error:
@@ -307,7 +307,7 @@ def _record_of(item: Any, repo: Repository) -> FileRecord | None:
 
 
 def _with_xet_or_without(download: Any, **arguments: Any) -> str:
-    """Download; where the Xet route fails (some mirrors announce it and lack it), over HTTP."""
+    """Download a file; if the Xet route fails, as with some mirrors, download it over HTTP."""
     try:
         return str(download(**arguments))
     except Exception as error:
@@ -318,7 +318,7 @@ def _with_xet_or_without(download: Any, **arguments: Any) -> str:
 
 
 def _came_through_xet(error: BaseException | None) -> bool:
-    """Whether the client was in a function of its Xet route when it failed."""
+    """Whether an exception came from the client's Xet route."""
     while error is not None:
         for frame, _ in walk_tb(error.__traceback__):
             module = str(frame.f_globals.get("__name__"))

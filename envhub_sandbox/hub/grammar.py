@@ -1,7 +1,7 @@
-"""What a hub reference may be made of, and the forms in which people write one.
+"""The grammar of hub references: the forms that people write, and the checks of their parts.
 
-``read`` reads a plain one, ``hf://``, and pages of the Hub's site; ``check`` then judges the parts.
-Both raise ``Wrong``, which says what to write instead.
+``read`` reads a plain reference, ``hf://``, and URLs of the Hub's site; ``check`` then checks the
+parts. Both raise ``Wrong``, which says what to write instead.
 Repository names follow ``huggingface_hub.utils.validate_repo_id``, revisions follow
 ``git check-ref-format``, and paths are relative, forward and to a ``.py`` file.
 """
@@ -20,7 +20,7 @@ from envhub_sandbox.system.platform import IS_WINDOWS
 DEFAULT_PATH = "env.py"
 REPO_TYPES = ("model", "space", "dataset")
 LOCAL_TYPES = FOLDER, FILE = "local", "file"
-"""Of what is of this machine: a folder, or a file with what is its own."""
+"""The types of snapshots of this machine: of a folder, or of a file with what it imports."""
 GRAMMAR = "owner/name, owner/name@revision, owner/name:path.py or owner/name@revision:path.py"
 
 _COMMIT = re.compile(r"[0-9a-f]{40}")
@@ -35,7 +35,7 @@ _INSIDE = "a path inside the repository, such as 'owner/name:envs/env.py'"
 
 
 class Parts(NamedTuple):
-    """The fields of a reference, before anybody has looked at them."""
+    """The fields of a reference, not checked yet."""
 
     repo_id: str
     revision: str | None = None
@@ -44,7 +44,7 @@ class Parts(NamedTuple):
 
 
 class Wrong(Exception):
-    """A reference cannot be read: what is wrong with it, and what to write instead."""
+    """A reference cannot be read; says what is wrong with it, and what to write instead."""
 
     def __init__(self, reason: str, write: str) -> None:
         super().__init__(reason, write)
@@ -53,7 +53,7 @@ class Wrong(Exception):
 
 
 def join(parts: Parts) -> str:
-    """The canonical text of a reference, of whatever kind."""
+    """The canonical text of a reference of any type."""
     if parts.repo_type == "pypi":
         package, _, env_id = parts.repo_id.partition("#")
         return f"pypi:{package}{f'@{parts.revision}' if parts.revision else ''}#{env_id}"
@@ -65,7 +65,7 @@ def join(parts: Parts) -> str:
 
 
 def local_reference(repo_type: str, folder: str, path: str) -> str:
-    """The text that means a folder of this machine with its entry file, or the file alone."""
+    """The reference of a folder of this machine with its entry file, or of the file alone."""
     return os.path.join(folder, path) if repo_type == FILE else f"{folder}:{path}"
 
 
@@ -75,19 +75,19 @@ def is_commit(revision: str) -> bool:
 
 
 def is_local(text: str) -> bool:
-    """Whether it names a folder here: ``./env``, ``../env``, ``/env``, ``~/env``, ``examples:``."""
+    """Whether a reference is local: ``./env``, ``../env``, ``/env``, ``~/env``, ``examples:``."""
     prefixes = ("./", "../", "/", "~/", ".\\", "..\\", "examples:")
     drive = IS_WINDOWS and _DRIVE.match(text) is not None
     return text in (".", "..", "~") or text.startswith(prefixes) or drive
 
 
 def has_control_characters(text: str) -> bool:
-    """Whether anything in the text would move a terminal's cursor or forge a log line."""
+    """Whether the text has a character that moves a terminal's cursor or forges a log line."""
     return not all(c == " " or c.isprintable() for c in text)
 
 
 def check(parts: Parts) -> None:
-    """Raise ``Wrong`` unless the Hub could have every part."""
+    """Raise ``Wrong`` if the Hub cannot have one of the parts."""
     if parts.repo_type is not None and parts.repo_type not in REPO_TYPES:
         raise Wrong(f"there is no repository type {parts.repo_type!r}", " or ".join(REPO_TYPES))
     _check_repo_id(parts)
@@ -113,7 +113,7 @@ def _check_repo_id(parts: Parts) -> None:
 
 
 def check_revision(parts: Parts) -> None:
-    """Raise ``Wrong`` unless git could have such a revision."""
+    """Raise ``Wrong`` if git cannot have such a revision."""
     revision = parts.revision
     if revision is None:
         return
@@ -127,7 +127,7 @@ def check_revision(parts: Parts) -> None:
 
 
 def check_path(parts: Parts) -> None:
-    """Raise ``Wrong`` unless it is a Python file inside of the repository."""
+    """Raise ``Wrong`` if the path is not a Python file inside of the repository."""
     path = parts.path
     pieces = path.replace("\\", "/").split("/")
     if not path:
@@ -167,7 +167,7 @@ def _suggest(parts: Parts, path: str | None) -> str:
 
 
 def _inside(pieces: list[str]) -> str | None:
-    """The path without ``..`` and empty steps; None if it climbs out or ends in no file."""
+    """The path without ``..`` and empty steps; None if it leaves the repository or is no .py."""
     kept: list[str] = []
     for piece in (p.strip() for p in pieces):
         if piece == ".." and not kept:
@@ -210,7 +210,7 @@ def _refuse_other_texts(text: str) -> None:
 
 
 def _read_plain(text: str) -> Parts:
-    """``[type/]owner/name[@revision][:path]``; an ``@`` behind the colon belongs to the path."""
+    """Read ``[type/]owner/name[@revision][:path]``; an ``@`` after the colon is in the path."""
     head, colon, path = text.partition(":")
     repo, at, revision = head.partition("@")
     kind, repo_id = _split_repo(repo, text[len(repo) :])
@@ -219,14 +219,14 @@ def _read_plain(text: str) -> Parts:
 
 
 def parts_of(kind: str | None, repo_id: str, revision: str | None, path: str) -> Parts:
-    """The parts, with a commit in lower case."""
+    """Make the parts; a commit becomes lower case."""
     if revision is not None and is_commit(revision.lower()):
         revision = revision.lower()
     return Parts(repo_id, revision, path, kind)
 
 
 def normal_path(path: str) -> str:
-    """``./a//b.py`` is ``a/b.py``; what is absolute or climbs stays, to be refused."""
+    """Normalise ``./a//b.py`` to ``a/b.py``; paths that ``check_path`` refuses stay unchanged."""
     if path.startswith("/") or "\\" in path:
         return path
     kept = "/".join(step for step in path.split("/") if step not in ("", "."))
@@ -234,7 +234,7 @@ def normal_path(path: str) -> str:
 
 
 def _split_repo(repo: str, rest: str) -> tuple[str | None, str]:
-    """Split ``[type/]owner/name``; ``rest`` is what stood behind it, for the suggestions."""
+    """Split ``[type/]owner/name``; ``rest``: the text after it, for suggestions in errors."""
     steps = repo.split("/")
     kind, prefix = None, ""
     if len(steps) > 1 and steps[0] in _TYPE_OF_PREFIX:
@@ -266,7 +266,7 @@ def _too_many_slashes(prefix: str, steps: list[str], rest: str) -> Wrong:
 
 
 def _read_hf(text: str, rest: str) -> Parts:
-    """``hf://[type/]owner/name[@revision][/path]``, or with ``:path`` as in a plain one."""
+    """Read ``hf://[type/]owner/name[@revision][/path]``, also with ``:path``."""
     if ":" in rest:
         return _read_plain(rest)
     steps = rest.strip("/").split("/")
@@ -279,7 +279,7 @@ def _read_hf(text: str, rest: str) -> Parts:
 
 
 def _split_revision(steps: list[str]) -> tuple[str, list[str]]:
-    """A revision is one step (its slashes percent-encoded), or ``refs/pr/3`` and its like."""
+    """Split off a revision: one step (slashes percent-encoded), or a ref such as ``refs/pr/3``."""
     slashed = _SLASHED_REVISION.match("/".join(steps))
     if slashed is not None:
         return unquote(slashed.group()), steps[3:]
@@ -311,7 +311,7 @@ def _read_url(url: str, _: str) -> Parts:
 
 
 def _read_page(steps: list[str]) -> Parts:
-    """``[type/]owner/name``, then nothing, a commit, or a file page with revision and path."""
+    """Read the path of a URL: ``[type/]owner/name``, and the page of a commit or of a file."""
     lead = 3 if steps and steps[0] in _TYPE_OF_PREFIX else 2
     repo = "/".join(steps[:lead]).removesuffix(".git")
     if len(steps) < lead:

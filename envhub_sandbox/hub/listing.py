@@ -1,7 +1,7 @@
-"""What a snapshot is made of: its files and their digests, and what a listing may ask of a disk.
+"""The files of a snapshot with their digests, and the checks of a listing and of files.
 
-A listing is somebody else's text: its names become paths here and its sizes become bytes here,
-so both are judged before anything is downloaded. What comes then is hashed while it is written.
+A listing is a stranger's text: its names become paths here and its sizes become bytes on disk, so
+both are checked before anything is downloaded. Downloaded bytes are hashed while they are written.
 """
 
 from __future__ import annotations
@@ -40,10 +40,11 @@ MAX_DEPTH = 64
 
 @dataclass(frozen=True)
 class FileRecord:
-    """One file of a snapshot, by its path relative to the root, with ``/``, and its bytes.
+    """One file of a snapshot: its path relative to the root, with ``/``, its size and digest.
 
     The digest is ``"git-sha1:<40 hex>"``, the git blob id, or ``"sha256:<64 hex>"`` for files in
-    LFS and files of a local folder. Git and folders say what is executable; the Hub does not.
+    LFS and files of a local folder. Git and local folders say which files are executable; the Hub
+    does not.
     """
 
     path: str
@@ -53,7 +54,7 @@ class FileRecord:
 
 
 Copier = Callable[[FileRecord, Path], None]
-"""Writes the file of a record; raises unless it wrote what the record says."""
+"""Writes the file of a record; raises if the bytes are not those of the record."""
 
 
 class Repository(NamedTuple):
@@ -64,11 +65,12 @@ class Repository(NamedTuple):
 
 
 class CommitFiles(NamedTuple):
-    """The files of a commit at a host.
+    """The files of a commit at a host, not trusted yet.
 
     Attributes:
-        listing: What there is, before anything of it is believed.
-        copier: Brings these files, and gives what copies each into the store; has a title, too.
+        listing: The records of the files, not checked yet.
+        copier: Downloads files, with a title for errors; returns a function that copies each file
+            into the store.
     """
 
     listing: Iterator[FileRecord]
@@ -76,35 +78,35 @@ class CommitFiles(NamedTuple):
 
 
 class RepositoryHost(Protocol):
-    """Where repositories are: the Hub, or a host of git. Every method raises ``HubFailure``."""
+    """A host of repositories: the Hub, or a git host. Every method raises ``HubFailure``."""
 
     @property
     def public_endpoint(self) -> str:
-        """Its address, without a login."""
+        """The host's address without a login."""
 
     def resolve(self, repo: Repository, revision: str | None) -> str:
         """The full commit that a revision is now."""
 
     def files(self, repo: Repository, commit: str) -> AbstractContextManager[CommitFiles]:
-        """The files of a commit, as long as the context lasts."""
+        """The files of a commit, valid within the context."""
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A repository's files at one commit: verified, real files, read-only, never imported here.
+    """A repository's files at one commit: verified, read-only, regular, never imported here.
 
     Attributes:
-        repo_id: ``"owner/name"``; for a local folder, also that of a file, its absolute path; for
-            git ``"https://host/org/repo"``; for a package ``"name@version#id"``.
+        repo_id: ``"owner/name"``; for a local folder, or a local file's folder, its absolute path;
+            for git ``"https://host/org/repo"``; for a package ``"name@version#id"``.
         repo_type: ``"model"``, ``"space"``, ``"dataset"``, ``"git"``, ``"pypi"``; ``"local"`` for
-            a folder, ``"file"`` for a file of this machine with what is its own.
-        commit: The full commit; of this machine and for a package ``local-`` or ``pypi-``, and a
-            hash of the content.
+            a local folder, ``"file"`` for a local file with what it imports.
+        commit: The full commit; for local files and packages ``local-`` or ``pypi-`` with a hash
+            of the content.
         path: The entry file, relative to ``root``, for example ``"env.py"``.
         root: The folder that holds the files (0444, programs 0555, in folders 0555) and nothing
             else.
         files: Every file below ``root``, sorted by path.
-        revision: What was asked for; None for nothing in particular.
+        revision: The revision in the reference; None if it has none.
         assets: Further repositories that its code may read.
     """
 
@@ -119,7 +121,7 @@ class Snapshot:
 
     @property
     def is_local(self) -> bool:
-        """Whether it is of this machine."""
+        """Whether it is a snapshot of a folder or file of this machine."""
         return self.repo_type in LOCAL_TYPES
 
     @property
@@ -129,9 +131,9 @@ class Snapshot:
 
     @property
     def reference(self) -> str:
-        """A reference that means this snapshot, wherever it is read.
+        """A reference that means this snapshot on every machine.
 
-        What a package is then depends on the version in it, and on a lock.
+        For a package, only its version and a lock determine the content.
         """
         if self.is_local:
             return local_reference(self.repo_type, self.repo_id, self.path)
@@ -141,9 +143,9 @@ class Snapshot:
 
     @property
     def hub_copies(self) -> tuple[tuple[str, str, tuple[str, ...], str], ...]:
-        """What a jail finds in its cache of the Hub, itself and assets: the fields of ``HubCopy``.
+        """The repository and assets that a jail finds in its Hub cache: the fields of ``HubCopy``.
 
-        A folder of this machine, for instance, is nothing that the Hub has.
+        Only repositories of the Hub are in it.
         """
         return tuple(
             (
@@ -158,7 +160,7 @@ class Snapshot:
 
     @property
     def name(self) -> str:
-        """The repository, as a reference begins; of a local folder its path."""
+        """The repository's part of a reference; for a local folder its path."""
         is_plain = self.is_local or self.repo_type == "model"
         return self.repo_id if is_plain else join(Parts(self.repo_id, repo_type=self.repo_type))
 
@@ -170,7 +172,7 @@ class Snapshot:
         return f"{self._source}:{self.path}"
 
     def known_as(self, path: str) -> str | None:
-        """A file as its author knows it, for tracebacks; None if there is none of that name."""
+        """The name by which the author knows a file, for tracebacks; None if it does not exist."""
         index = bisect_left(self.files, path, key=attrgetter("path"))
         if index == len(self.files) or self.files[index].path != path:
             return None
@@ -185,15 +187,15 @@ class Snapshot:
 
 
 def content_digest(files: tuple[FileRecord, ...]) -> str:
-    """A hash of names and contents, which is the commit of what has none."""
+    """A hash of names and contents, used as the commit of files without one."""
     rows = [[file.path, file.size, file.digest, *[True] * file.executable] for file in files]
     return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
 
 def _cached_revisions(snapshot: Snapshot) -> tuple[str, ...]:
-    """What is found in a jail: ``main``, and what was asked for, if a file can be called so."""
+    """The revisions in a jail's Hub cache: ``main``, and the one in the reference if possible."""
     revision = snapshot.revision or "main"
-    # beside the file "main" there is no folder of that name
+    # "main" is a file there, so it cannot be a folder as well
     cached = (
         revision != snapshot.commit
         and not revision.startswith("main/")
@@ -204,7 +206,7 @@ def _cached_revisions(snapshot: Snapshot) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class SnapshotLimits:
-    """What a repository may bring: judged by its listing before the download, then on disk."""
+    """Limits of a repository's files, checked by its listing before the download, then on disk."""
 
     max_bytes: int = 4 * 2**30
     max_files: int = 20_000
@@ -226,7 +228,7 @@ _File = TypeVar("_File", bound=Any)  # with a path and a size
 def listing_within_limits(
     files: Iterable[_File], limits: SnapshotLimits, title: str
 ) -> tuple[_File, ...]:
-    """The files, sorted by path; ``SnapshotTooLargeError`` as soon as a limit is passed."""
+    """The files, sorted by path. Raises ``SnapshotTooLargeError`` as soon as a limit is passed."""
     taken: list[_File] = []
     total = 0
     for file in files:
@@ -252,7 +254,7 @@ def _too_large(title: str, excess: str, name: str, limit: int) -> SnapshotTooLar
 
 
 def check_listing_names(files: Iterable[FileRecord], title: str) -> None:
-    """Raise ``SnapshotError`` for a name that could leave the tree, hide, or clash."""
+    """Raise ``SnapshotError`` for a name that leaves the tree, is invalid, or clashes."""
     seen: set[str] = set()
     folders: set[str] = set()
     for file in files:
@@ -287,7 +289,7 @@ SHA256 = "sha256"
 
 
 class HashMismatch(Exception):
-    """Bytes are not the ones that were recorded; ``found`` says in words what they are."""
+    """The bytes of a file are not the recorded ones; ``found`` describes them."""
 
     def __init__(self, digest: str) -> None:
         super().__init__(digest)
@@ -297,7 +299,7 @@ class HashMismatch(Exception):
 def _start(kind: str, size: int) -> Any:
     if kind == SHA256:
         return hashlib.sha256()
-    # A git blob id covers the length too; git chose SHA-1, we only follow.
+    # A git blob id covers the length, too. Git chose SHA-1; we only follow.
     sha1 = hashlib.sha1(usedforsecurity=False)
     sha1.update(b"blob %d\x00" % size)
     return sha1
@@ -312,15 +314,15 @@ def digest_of(source: Path, kind: str, size: int) -> str:
 
 
 def copy_verified(source: Path, target: Path, record: FileRecord) -> None:
-    """Copy a file into a new one; as ``write_verified``."""
+    """Copy a file into a new file; raises as ``write_verified``."""
     with _open_regular(source) as stream:
         write_verified(stream, target, record)
 
 
 def write_verified(stream: IO[bytes], target: Path, record: FileRecord) -> None:
-    """Write a new file; what was written is exactly what the record says, or ``HashMismatch``.
+    """Write a new file. Raises ``HashMismatch`` unless its bytes are exactly the recorded ones.
 
-    The hash is taken of the bytes on their way, so they cannot change in between.
+    The bytes are hashed while they are written, so they cannot change in between.
     """
     kind = record.digest.partition(":")[0]
     running = _start(kind, record.size)
@@ -334,7 +336,7 @@ def write_verified(stream: IO[bytes], target: Path, record: FileRecord) -> None:
 
 
 def differing(root: Path, mine: Iterable[FileRecord], theirs: Iterable[FileRecord]) -> list[str]:
-    """The files below ``root`` that another listing has with other bytes, or not at all."""
+    """The paths of files below ``root`` that another listing lacks, or has with other bytes."""
     listed = {record.path: record for record in theirs}
     return [
         file.path
@@ -348,7 +350,7 @@ def differing(root: Path, mine: Iterable[FileRecord], theirs: Iterable[FileRecor
 @contextmanager
 def _open_regular(path: Path) -> Iterator[IO[bytes]]:
     try:
-        # A pipe or device under the name would block or never end.
+        # reading a pipe or device of this name could block or never end
         if not stat.S_ISREG(os.stat(path).st_mode):
             raise HashMismatch("not a regular file")
         stream = path.open("rb")
@@ -359,8 +361,8 @@ def _open_regular(path: Path) -> Iterator[IO[bytes]]:
 
 
 def copy_bounded(source: IO[bytes], target: IO[bytes] | None, most: int, digest: Any = None) -> int:
-    """Copy a stream by blocks, and hash it on its way, to the first byte beyond ``most`` at the
-    furthest; gives the number of bytes.
+    """Copy a stream in blocks and hash it; stops after ``most`` + 1 bytes. Returns the number of
+    bytes, which is larger than ``most`` if the stream is.
     """
     count = 0
     while count <= most and (block := source.read(min(most + 1 - count, _BLOCK))):

@@ -1,12 +1,13 @@
-"""A folder or a file of this machine as a snapshot, so that authors can try before they push.
+"""Snapshots of a folder or a file of this machine, so that authors can try before they push.
 
-In a git checkout a folder is the files that git would commit, as it would commit them: a link is a
-file that holds the link's text. Elsewhere it is every file; links that stay inside the folder are
-copied as what they point to, and a link that leaves it is refused, since the jail must see nothing
-but the folder. ``.git`` is in no commit, and left out everywhere, as are sockets and pipes.
+In a git checkout the snapshot has the files that git would commit, and a link is a file with the
+link's text. Elsewhere it has every file of the folder. A link inside the folder is replaced by its
+target, and a link that leaves the folder is refused, since the jail must see nothing but the
+folder. ``.git``, sockets and pipes are always left out.
 
-A file gives of its folder what is its own (``sources.own``), and what git tracks there. Who names a
-file may have anything beside it, so no link is followed, and no file that holds keys is taken.
+The snapshot of a file has the files of its folder that it needs (``sources.own``), and those that
+git tracks. Unrelated files may lie beside it, so no link is followed, and no file that looks like
+keys is taken.
 """
 
 from __future__ import annotations
@@ -67,31 +68,31 @@ _CURES = {
     _DEAD_LINK: "Put a file in its place",
     _SECRET: "Name the folder, with {allow}",
 }
-"""Why something is left out of a snapshot, and how it comes in."""
+"""The reasons why a file is left out of a snapshot, each with advice on how to include it."""
 
 
 class Checkout(Protocol):
-    """What git would commit of a folder: see the extra ``sources.checkout``."""
+    """The files of a folder that git would commit: see the extra ``sources.checkout``."""
 
     @property
     def files(self) -> frozenset[str]:
-        """The files and nested repositories that a commit of everything would hold."""
+        """The files and nested repositories that a commit of everything would have."""
 
     @property
     def folders(self) -> frozenset[str]:
-        """Every folder above these."""
+        """Every folder that contains one of these."""
 
     @property
     def tracked(self) -> frozenset[str]:
-        """The files that git knows already."""
+        """The files that git tracks already."""
 
     def tracks_below(self, folder: str) -> bool:
-        """Whether git knows a file in a folder."""
+        """Whether git tracks a file in a folder."""
 
 
 class LocalFile(NamedTuple):
-    """A file of a folder: its name in the snapshot, where its bytes are, its size, and whether it
-    is a program; or the text of a link that git would commit, which is then its content.
+    """A file of a folder: its name in the snapshot, its path on this machine, its size, and whether
+    it is executable; for a link that git would commit, also the link's text, its content.
     """
 
     path: str
@@ -102,20 +103,20 @@ class LocalFile(NamedTuple):
 
     @classmethod
     def at(cls, path: str, source: Path) -> LocalFile:
-        """A regular file."""
+        """Describe a regular file."""
         status = source.stat(follow_symlinks=False)
         return cls(path, source, status.st_size, bool(status.st_mode & stat.S_IXUSR))
 
 
 class LeftOut(NamedTuple):
-    """What lies there and is not in the snapshot, and why; a folder has a slash at its end."""
+    """A file or folder (with a slash at its end) that is not in the snapshot, and why."""
 
     path: str
     why: str
 
 
 class Listing(NamedTuple):
-    """The files of a snapshot, sorted, with their records; and what was left out."""
+    """The sorted files of a snapshot, their records, and the files that were left out."""
 
     files: tuple[LocalFile, ...]
     records: tuple[FileRecord, ...]
@@ -124,11 +125,11 @@ class Listing(NamedTuple):
 
 @dataclass(frozen=True)
 class LocalFolder:
-    """A folder of this machine, without links in its path; every file counts where git says nothing
-    of it.
+    """A folder of this machine, by a path without links; without a checkout, every file is in the
+    snapshot.
 
     Attributes:
-        entry: The file, where a file was named: then it is what that file's code gets to see.
+        entry: The file, if a file was named; the snapshot then has what this file's code may see.
     """
 
     root: Path
@@ -142,16 +143,16 @@ class LocalFolder:
 
     @classmethod
     def at(cls, folder: str | Path, entry: str | None = None) -> LocalFolder:
-        """The folder at a path, or of it what a file gets to see."""
+        """The folder at a path, or with ``entry`` its part that this file may see."""
         root = Path(os.path.realpath(folder))
         read_checkout = extras.find("envhub_sandbox.extras.sources.checkout", "read_checkout")
-        # a home is no repository of a file's, though some keep it in git
+        # if the file is in a home directory, git's files there, if any, are not the file's
         is_own = entry is not None and is_home(root)
         return cls(root, None if is_own or read_checkout is None else read_checkout(root), entry)
 
     @classmethod
     def of(cls, snapshot: Snapshot) -> LocalFolder:
-        """What a snapshot is a copy of."""
+        """The folder or file that a snapshot is a copy of."""
         entry = snapshot.path if snapshot.repo_type == FILE else None
         return cls.at(snapshot.repo_id, entry)
 
@@ -166,8 +167,9 @@ class LocalFolder:
         Raises ``SnapshotError``: they cannot be read; ``PolicyError``: it is a folder with keys, or
         a home.
         """
-        # Cheap refusals first: a home may hold millions of files. No content is read before the
-        # names have been looked at for keys, so that none is hashed unasked.
+        # The order matters. A home directory is refused before it is listed, since it may have
+        # millions of files. Names are checked for keys before any content is read, so that no key
+        # is read unless the caller allows it. Then all files are hashed.
         left: list[LeftOut] = []
         if self.entry is None and not allow_secrets and is_home(self.root):
             raise self._secret("is a home directory, or has one in it")
@@ -206,7 +208,7 @@ class LocalFolder:
                 left.append(item)
 
     def seen(self, listing: Listing) -> str:
-        """One line about what the code gets to see."""
+        """One line about the files that the code can see."""
         names = [item.path for item in listing.files]
         summary = f"{self}: the code sees {counted(len(names), 'file')} of "
         summary += "it" if self.entry is None else f"its folder: {_shown(names)}"
@@ -216,7 +218,7 @@ class LocalFolder:
         return summary
 
     def warn_of_requirements(self, listing: Listing) -> None:
-        """Other packages than its author's may give other results."""
+        """Warn if a requirements.txt beside a file is not used: other packages, other results."""
         beside = self.root / _REQUIREMENTS
         if self.entry is None or not beside.is_file():
             return
@@ -229,11 +231,11 @@ class LocalFolder:
         )
 
     def as_folder(self) -> str:
-        """A reference that shows the folder of a file as a whole."""
+        """The reference of a file's whole folder."""
         return repr(local_reference(FOLDER, str(self.root), str(self.entry)))
 
     def advice(self, path: str) -> str:
-        """What to do so that the code sees what is there, by its path."""
+        """Advice on how to show the code a file that exists in the folder."""
         if self.entry is not None:
             return (
                 f"{path!r} is there, in {self.root}, but a file that is named alone shows the code "
@@ -245,7 +247,7 @@ class LocalFolder:
         return f"{self} {reason}. {cure}"
 
     def why_left_out(self, path: str) -> tuple[str, str] | None:
-        """What to say of a file that is there, and that is not in the snapshot, and what to do."""
+        """Why an existing file is not in the snapshot, and advice; None if it was not left out."""
         for item in self.left_out():
             if f"{path}/".startswith(f"{item.path.rstrip('/')}/"):
                 allow = option_name("allow_secrets", True)
@@ -254,7 +256,7 @@ class LocalFolder:
         return None
 
     def left_out(self) -> Iterator[LeftOut]:
-        """Yield what lies here and is not in the snapshot; empty folders aside."""
+        """Yield files and folders that are not in the snapshot, except empty folders."""
         items = (item for item in self._found() if isinstance(item, LeftOut))
         return (item for item in items if not _is_empty_folder(self.root / item.path))
 
@@ -297,7 +299,7 @@ class LocalFolder:
             elif stat.S_ISDIR(mode):
                 yield from self._committed(checkout, path, f"{name}/")
             elif not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
-                continue  # git knows no sockets, pipes and devices
+                continue  # git ignores sockets, pipes and devices
             elif name not in checkout.files:
                 yield LeftOut(name, IGNORED)
             elif stat.S_ISLNK(mode):
@@ -305,7 +307,7 @@ class LocalFolder:
                 yield LocalFile(name, path, len(text), link=text)
             elif name in checkout.tracked or os.access(path, os.R_OK):
                 yield LocalFile.at(name, path)
-            else:  # a commit has what is tracked, so nothing of that is left out
+            else:  # a tracked file is never left out, since a commit has it
                 yield LeftOut(name, _UNREADABLE)
 
     def _all(
@@ -320,7 +322,7 @@ class LocalFolder:
             yield LeftOut(name, _LINK)
             return
         if path.is_symlink() and not os.path.exists(os.path.realpath(path)):
-            yield LeftOut(name, _DEAD_LINK)  # editors lock files by such
+            yield LeftOut(name, _DEAD_LINK)  # some editors lock files by dead links
             return
         source = self._inside(path, name)
         if source.is_dir() and _is_venv(source):
@@ -359,11 +361,11 @@ def _shown(names: Collection[str]) -> str:
 
 
 def _is_venv(folder: Path) -> bool:
-    """Whether it is a virtual environment that was made here, as no commit can have one: its
-    interpreter is a link, or a program of Windows.
+    """Whether a folder is a virtual environment that was made here. Its interpreter is a link or a
+    Windows program, unlike in a copy from a commit.
     """
     program, other = folder / "bin/python", folder / "Scripts/python.exe"
-    is_made = os.path.islink(program) or os.path.isfile(other)  # which raise nothing
+    is_made = os.path.islink(program) or os.path.isfile(other)  # these never raise
     return is_made and os.path.isfile(folder / "pyvenv.cfg")
 
 
@@ -371,29 +373,29 @@ def _is_empty_folder(path: Path) -> bool:
     try:
         return path.is_dir() and not os.listdir(path)
     except OSError:
-        return False  # what may not be read may hold anything
+        return False  # an unreadable folder may have files
 
 
 class LocalPath(NamedTuple):
-    """What a reference means here: a folder, its entry file, and whether only that was named."""
+    """A local reference: the folder, the entry file, and whether only the file was named."""
 
     folder: Path
     path: str
     is_file: bool = False
 
     def listed(self, *, allow_secrets: bool = False) -> tuple[LocalFolder, Listing]:
-        """What its code gets to see; raises as ``LocalFolder.listed``."""
+        """The folder and the files that its code may see; raises as ``LocalFolder.listed``."""
         folder = LocalFolder.at(self.folder, self.path if self.is_file else None)
         return folder, folder.listed(allow_secrets=allow_secrets)
 
     @property
     def repo_type(self) -> str:
-        """Of its snapshot."""
+        """The type of its snapshot."""
         return FILE if self.is_file else FOLDER
 
 
 def split_local(text: str) -> LocalPath:
-    """What ``./env``, ``./env:sub/env.py``, ``./x/other.py`` or ``examples:x`` means."""
+    """Read a local reference: ``./env``, ``./env:sub/env.py``, ``./x/other.py``, ``examples:x``."""
     if text.startswith(_EXAMPLES):
         text = str(_example(text))
     folder = Path(os.path.abspath(os.path.expanduser(text)))
@@ -418,7 +420,7 @@ def split_local(text: str) -> LocalPath:
 
 
 def _similar(path: Path) -> str:
-    """A question about what has nearly that name."""
+    """A question that suggests an existing path of a similar name; or empty."""
     import difflib
 
     with contextlib.suppress(OSError):
@@ -431,7 +433,7 @@ def _similar(path: Path) -> str:
 
 
 def _example(text: str) -> Path:
-    """The folder of an example: in the checkout that this is, or where the wheel has put it."""
+    """The folder of an example, in this checkout or where the wheel has installed it."""
     checkout = Path(__file__).resolve().parents[2]
     import sysconfig  # rarely needed, and slow to import
 
@@ -462,7 +464,7 @@ def _digest(file: LocalFile, title: str) -> str:
 
 
 def copier(files: tuple[LocalFile, ...], title: str) -> Callable[[FileRecord, Path], None]:
-    """A function that copies one file into the store, or says that it changed meanwhile."""
+    """A function that copies one file into the store; it raises if the file has changed."""
     by_path = {file.path: file for file in files}
 
     def copy(record: FileRecord, target: Path) -> None:

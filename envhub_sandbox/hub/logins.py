@@ -1,7 +1,7 @@
-"""Logins in URLs, as in ``https://user:password@hub.example``: sent as a header, never kept.
+"""Removes logins from URLs such as ``https://user:password@hub.example``, to send as a header.
 
-A URL is shown, logged and raised by every library that it passes through. So the login is taken
-out of it at once, and no pickle, repr, crash bundle, log or error ever has it.
+Every library shows, logs and raises the URLs that it gets. So the login is removed from the URL at
+once, and no pickle, repr, crash bundle, log or error ever contains it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def without_login(url: str) -> str:
 
 
 def login_of(url: str) -> tuple[str, str] | None:
-    """User and password of a URL, or None."""
+    """The user and password of a URL, or None."""
     match = _LOGIN.search(url)
     if match is None:
         return None
@@ -28,5 +28,5 @@ def login_of(url: str) -> tuple[str, str] | None:
 
 
 def authorization(login: tuple[str, str]) -> str:
-    """The value of the header that a login is sent in, as HTTP clients make it of a URL."""
+    """The value of the ``Authorization`` header for a login (HTTP Basic)."""
     return "Basic " + base64.b64encode(":".join(login).encode()).decode()

@@ -1,11 +1,10 @@
 """Hub references: ``[models/|spaces/|datasets/]owner/name[@revision][:path]``, and Hub URLs.
 
-And of the extra ``sources``: a commit of git (``git_address``), and an environment that a package
-of the index registers (``registered``). ``read`` and ``check`` of such a module are to its
-references what those of ``hub.grammar`` are to the Hub's. A reference is text that somebody pasted,
-so every form that can mean only one thing works, and for every other form the error says what to
-write instead. Extends the grammar of ``lerobot.envs.utils._parse_hub_url``. Nothing is asked of the
-network.
+The extra ``sources`` adds references of a commit of git (``git_address``) and of an environment
+that a package of the index registers (``registered``). Each of these modules has a ``read`` and a
+``check``, like ``hub.grammar``. Users paste references, so every form that can mean only one thing
+works, and for every other form the error says what to write instead. Extends the grammar of
+``lerobot.envs.utils._parse_hub_url``. Sends no requests.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ __all__ = ["DEFAULT_PATH", "REPO_TYPES", "HubRef", "is_local", "is_of_another_pl
 
 
 class _Scheme(NamedTuple):
-    """References that are none of the Hub's: how they begin, and the module that reads them."""
+    """A kind of references outside of the Hub: how they begin, and the module that reads them."""
 
     kind: str
     module: str
@@ -63,16 +62,16 @@ class HubRef:
     """One environment file of one repository, at one revision.
 
     Attributes:
-        repo_id: ``"owner/name"``; of git ``"https://host/org/repo"``; of a package
+        repo_id: ``"owner/name"``; for git ``"https://host/org/repo"``; for a package
             ``"name[extra]#id"``.
-        revision: A branch, tag, pull request (``"refs/pr/3"``) or commit; None for ``main``, and of
-            git for ``HEAD``. Of a package its version; None for any.
+        revision: A branch, tag, pull request (``"refs/pr/3"``) or commit; None for ``main``, or for
+            ``HEAD`` of git. For a package its version; None for any version.
         path: The entry file, relative to the repository's root, with ``/``.
         repo_type: ``"model"``, ``"space"`` or ``"dataset"``; None for "model first, then space";
             ``"git"``; ``"pypi"`` for a package.
 
     Raises:
-        HubReferenceError: When a part is not what the Hub could have.
+        HubReferenceError: The Hub cannot have one of the parts.
     """
 
     repo_id: str
@@ -91,7 +90,7 @@ class HubRef:
         """Read a reference, a Hub URL or an ``hf://`` path.
 
         Raises:
-            HubReferenceError: The text names the reference and what to write instead.
+            HubReferenceError: The text cannot be read; the error says what to write instead.
         """
         if not isinstance(text, str):
             raise HubReferenceError(f"a hub reference is a str ({grammar.GRAMMAR}), got {text!r}")
@@ -110,27 +109,27 @@ class HubRef:
 
     @property
     def is_pinned(self) -> bool:
-        """Whether the revision is a full commit, which can never mean anything else."""
+        """Whether the revision is a full commit, whose meaning never changes."""
         return self.repo_type != PYPI and is_commit(self.revision or "")
 
     @property
     def meaning(self) -> str:
-        """The same for every way to write it."""
+        """The canonical text, which is equal for all references of the same meaning."""
         return grammar.join(self.parts._replace(revision=self.usual_revision))
 
     @property
     def usual_revision(self) -> str | None:
-        """The revision, or what none means."""
+        """The revision, or the default one if there is none."""
         return self.revision or {GIT: "HEAD", PYPI: None}.get(self.repo_type or "", "main")
 
     @property
     def parts(self) -> Parts:
-        """Its fields."""
+        """The fields of the reference."""
         return Parts(self.repo_id, self.revision, self.path, self.repo_type)
 
 
 def pinned(repo_type: str, repo_id: str, commit: str, path: str) -> str:
-    """``Snapshot.reference``, by what a provenance says of it, which may be a stranger's."""
+    """``Snapshot.reference`` from the fields of a provenance, which may be a stranger's."""
     if repo_type in LOCAL_TYPES:
         return local_reference(repo_type, repo_id, path)
     if repo_type == PYPI:
@@ -139,7 +138,7 @@ def pinned(repo_type: str, repo_id: str, commit: str, path: str) -> str:
 
 
 def is_of_another_place(text: str) -> bool:
-    """Whether it is of git or of the package index, by how it begins."""
+    """Whether a reference is of git or of the package index, by its beginning."""
     return _scheme_of(text.strip()) is not None
 
 
@@ -154,6 +153,6 @@ def _check(parts: Parts) -> None:
 
 
 def _refusal(text: str, wrong: Wrong) -> HubReferenceError:
-    # A pasted URL may carry a token in front of its host; errors end up in logs.
+    # A pasted URL may have a token before its host, and errors end up in logs.
     shown = re.sub(r"://(?!git@)[^/]*@", "://***@", text)
     return HubReferenceError(f"hub reference {shown!r}: {wrong.what}; write {wrong.write}")

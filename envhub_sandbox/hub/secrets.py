@@ -1,4 +1,4 @@
-"""The names of files that hold keys, tokens or passwords, which no code gets to see unasked."""
+"""Recognises files that may have keys, tokens or passwords by their names."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LOGINS = """
 """
 _HARMLESS = "*.pub *.py *cacert.pem */.env.example */.env.sample */.env.template */.env.dist"
 _BARE_KEY = r"(?s:.*/id_[^./]+)\Z"
-"""What people call further keys, such as ``id_work``; with a suffix it is some other file."""
+"""Further names of keys, such as ``id_work``; a name with a suffix is not a key."""
 
 
 def _any_of(names: str, *expressions: str) -> re.Pattern[str]:
@@ -34,13 +34,13 @@ _NOT_SECRET = _any_of(_HARMLESS)
 
 
 def looks_secret(path: str) -> bool:
-    """Whether a file is one that holds keys or logins, by its path, with ``/``."""
+    """Whether a file may have keys or logins, by its path with ``/``."""
     name = f"/{path.lower()}"
     return _SECRET.match(name) is not None and _NOT_SECRET.match(name) is None
 
 
 def is_home(folder: Path) -> bool:
-    """Whether a folder, a path without links, is its owner's or the caller's home, or has that in
-    it.
+    """Whether a folder (a path without links) is, or contains, the home of its owner or of the
+    caller.
     """
     return any(home.is_relative_to(folder) for home in homes_of(folder))

@@ -1,8 +1,8 @@
-"""Snapshots: a repository's files at one commit, downloaded, verified, and never imported here.
+"""Snapshots: a repository's files at one commit, downloaded and verified, never imported here.
 
-``fetch`` resolves a revision once, holds the listing against limits, downloads the whole
-repository through huggingface_hub, compares every file with the listing's hash, and lays it out
-read-only in a store of our own. A full commit that is in the store costs no request.
+``fetch`` resolves a revision once, checks the listing against limits, downloads the whole
+repository by huggingface_hub, compares every file with the listing's hash, and puts it read-only
+into a store of our own. A full commit that is in the store costs no request.
 ``local`` does the same for a folder of this machine. See ``docs/snapshots.md``.
 """
 
@@ -63,11 +63,11 @@ T = TypeVar("T")
 
 
 def snapshot_named(reference: str, *, allow_secrets: bool = False, **hub: Any) -> Snapshot:
-    """The snapshot of a hub reference or of a local folder; raises as ``fetch`` and ``local`` do.
+    """The snapshot of a hub reference or a local folder; raises as ``fetch`` and ``local`` do.
 
-    The path of a ``.py`` file or of a folder that is here means that, with a warning where it could
-    be a repository of the Hub. ``hub`` are ``hub_cache_dir``, ``token``, ``endpoint`` and
-    ``public``, as ``fetch`` takes them.
+    The path of an existing ``.py`` file or folder is local, with a warning if it could also be a
+    repository of the Hub. ``hub`` are the arguments ``hub_cache_dir``, ``token``, ``endpoint`` and
+    ``public`` of ``fetch``.
     """
     if is_here(reference):
         _warn_of_two_meanings(reference)
@@ -82,20 +82,20 @@ def snapshot_named(reference: str, *, allow_secrets: bool = False, **hub: Any) -
 
 
 def is_here(reference: str) -> bool:
-    """Whether a reference names a folder or a file of this machine, or a .py file in a folder that
-    is here. What has a revision never does, nor what says that it is something else, as ``pypi:``.
+    """Whether a reference names an existing local folder or file, or a .py file in an existing
+    folder. A reference with a revision or a prefix such as ``pypi:`` is never local.
     """
     if is_local(reference) or (reference.endswith(".py") and os.path.isfile(reference)):
         return True
     folder, colon, _ = reference.partition(":")
     if not colon and folder.endswith(".py"):
-        folder = os.path.dirname(folder)  # its name may be mistyped
+        folder = os.path.dirname(folder)  # the file's name may be mistyped
     is_other = "@" in reference or "://" in reference or is_of_another_place(reference)
     return not is_other and os.path.isdir(folder)
 
 
 def _warn_of_two_meanings(reference: str) -> None:
-    """A folder that is here comes before a repository of the Hub, and not in silence."""
+    """Warn if an existing folder is used although a repository of the Hub may have its name."""
     if is_local(reference) or not os.path.isdir(reference.partition(":")[0]):
         return
     with contextlib.suppress(HubReferenceError):
@@ -117,34 +117,36 @@ def fetch(
     needs_entry: bool = True,
     public: bool = False,
 ) -> Snapshot:
-    """Bring a repository's files here, verified.
+    """Fetch a repository's files, verified, into the store.
 
     Args:
-        ref: What to fetch. A full commit that is in the store costs no request; a branch or tag
-            is always asked for, so that nothing stale is taken for it.
+        ref: The reference. A full commit that is in the store costs no request; a branch or tag is
+            always resolved anew, so that it is never stale.
         hub_cache_dir: huggingface_hub's ``cache_dir``, where downloads land before they are
             verified. The store itself is at ``$ENVHUB_CACHE`` or in the user's cache folder.
         token: As in huggingface_hub: None for the stored one, False for none.
         endpoint: As in huggingface_hub: None for ``$HF_ENDPOINT`` or https://huggingface.co.
-        limits: What the repository may bring.
-        needs_entry: False for one that is no environment: it may be of any type.
-        public: Only what everybody is given, without a login: for what a stranger names. What is
-            in the store because the caller's login has brought it is no answer.
+        limits: Bounds on the repository's files.
+        needs_entry: False for a repository without an environment, which may be of any type.
+        public: Only fetch what the Hub gives to everybody, without a login, since a stranger chose
+            the reference. A commit in the store that needed a login does not count.
 
     Raises:
-        RepositoryUnavailableError: No such repository, revision or file, no access, no Hub. The
-            text says which, and ``__cause__`` is the Hub client's error.
+        RepositoryUnavailableError: The repository, revision or file does not exist, or access or
+            the Hub is missing. ``__cause__`` is the Hub client's error.
         SnapshotTooLargeError: Over the limits; nothing was downloaded.
-        SnapshotIntegrityError: A file is not what the commit's listing says.
-        SnapshotError: A hostile name in the listing, or the store cannot be written.
-        HubReferenceError: The token or endpoint cannot be one.
+        SnapshotIntegrityError: A file differs from the commit's listing.
+        SnapshotError: The listing has a hostile name, or the store cannot be written.
+        HubReferenceError: The token or endpoint is malformed.
     """
     if ref.repo_type == PYPI:
         return _registered(ref)
     if public:
         token, endpoint = False, without_login(checked_endpoint(endpoint))
-    # The store first, since a pin that is there needs no request; then the hosts, in the order of
-    # the candidates: a model comes before a space of the same name.
+    # The order matters. The store comes first, since a pin in it needs no request. Then the hosts
+    # are asked in the order of the candidates: a model comes before a space of the same name. If a
+    # snapshot in the store is half deleted, it is fetched again; its remains are moved aside only
+    # when the new copy is complete.
     candidates = _candidates(ref, hub_cache_dir, token, endpoint, limits, needs_entry, public)
     try:
         for candidate in candidates if ref.is_pinned else ():
@@ -153,7 +155,7 @@ def fetch(
     except HubFailure as failure:
         raise _unavailable(candidates, [failure]) from failure.__cause__
     except store.HalfDeletedError as half:
-        try:  # what is left of it stays, until there is all of it
+        try:
             return _first(candidates, _Candidate.fetched)
         except RepositoryUnavailableError as error:
             error.args = (f"{half}\nThat was tried: {error}",)
@@ -170,7 +172,7 @@ def _candidates(
     needs_entry: bool = True,
     public: bool = False,
 ) -> Sequence[_Candidate]:
-    """As what it may be read."""
+    """The repositories that a reference may mean, in the order to try them."""
     if ref.repo_type == GIT:
         host_of = extras.required("envhub_sandbox.extras.sources.git_commits", "GitHost", str(ref))
         scheme, _, rest = ref.repo_id.partition("://")
@@ -185,7 +187,7 @@ def _candidates(
 
 
 def _first(candidates: Sequence[_Candidate], ask: Callable[[_Candidate], T]) -> T:
-    """The answer of the first candidate that is there; raises as ``fetch``."""
+    """The answer of the first candidate that exists; raises as ``fetch``."""
     failures: list[HubFailure] = []
     for candidate in candidates:
         try:
@@ -200,7 +202,7 @@ def _first(candidates: Sequence[_Candidate], ask: Callable[[_Candidate], T]) -> 
 def _unavailable(
     candidates: Sequence[_Candidate], failures: list[HubFailure]
 ) -> RepositoryUnavailableError:
-    """One error for all that was tried; the furthest attempt gives the advice."""
+    """Make one error of all failed candidates; the one that came furthest gives the advice."""
     ref, endpoint = candidates[0].ref, candidates[0].host.public_endpoint
     whats = "; and ".join(dict.fromkeys(failure.what for failure in failures))
     best = next((f for f in failures if f.kind is not Kind.NO_REPOSITORY), failures[0])
@@ -214,7 +216,7 @@ def _unavailable(
 
 
 def _in_store(candidates: Sequence[_Candidate], even_if_none: bool) -> str:
-    """Which commits can be had without the Hub, and how to write them."""
+    """A sentence about commits in the store that need no Hub, as references."""
     ref = candidates[0].ref
     commits = [stored for candidate in candidates for stored in store.commits(candidate.folder)]
     others = [stored for stored in commits if stored.commit != ref.revision][:_SHOWN_COMMITS]
@@ -231,8 +233,8 @@ def _in_store(candidates: Sequence[_Candidate], even_if_none: bool) -> str:
 def with_assets(
     snapshot: Snapshot, assets: Sequence[str], hub: Mapping[str, Any], locked: Sequence[str] = ()
 ) -> Snapshot:
-    """The snapshot with its assets: see ``extras.sources.assets``. Without that extra a card's are
-    not looked for. Raises ``SandboxUnavailableError``: others are asked for.
+    """Add assets to a snapshot: see ``extras.sources.assets``. Without that extra, assets that the
+    repository's card names are ignored. Raises ``SandboxUnavailableError``: the caller names some.
     """
     module, name = "envhub_sandbox.extras.sources.assets", "with_assets"
     if assets or locked:
@@ -243,17 +245,18 @@ def with_assets(
 
 
 def local(folder: str | Path, *, allow_secrets: bool = False) -> Snapshot:
-    """Copy a folder of this machine into the store, by content: unchanged is the same snapshot.
+    """Copy a local folder into the store; an unchanged folder gives the same snapshot.
 
-    It may also be ``folder:path/env.py``. Of a ``.py`` file it is what the file imports of its
-    folder, and what git tracks there. In a git checkout a folder is what git would commit, and
-    elsewhere every file; see ``hub.local``. What the code gets to see is told in a line.
+    ``folder`` may also be ``folder:path/env.py``. The snapshot of a ``.py`` file has the files that
+    it imports from its folder, and those that git tracks. The snapshot of a folder has the files
+    that git would commit, or every file outside of a checkout; see ``hub.local``. A line for the
+    user says which files the code can see.
 
     Args:
         allow_secrets: Whether a folder may hold keys or be a home directory.
 
     Raises:
-        RepositoryUnavailableError: There is no such folder or entry file.
+        RepositoryUnavailableError: The folder or the entry file does not exist.
         SnapshotError: A link leaves the folder, or a file has a name that the Hub cannot have;
             ``SnapshotTooLargeError`` over the limits.
         PolicyError: The folder holds keys, or is a home directory.
@@ -274,7 +277,7 @@ def local(folder: str | Path, *, allow_secrets: bool = False) -> Snapshot:
 
 
 def _registered(ref: HubRef) -> Snapshot:
-    """The repository of one file that stands for an environment of a package."""
+    """The snapshot of one generated file that makes an environment of a package."""
     text: bytes = extras.required("envhub_sandbox.extras.sources.registered", "entry", str(ref))(
         ref.parts
     )
@@ -295,12 +298,12 @@ def _by_content(
     files: tuple[FileRecord, ...],
     copy: Callable[[FileRecord, Path], None],
 ) -> Snapshot:
-    """A snapshot that is named by what is in it."""
+    """A snapshot whose commit is a hash of its content."""
     commit = f"{kind}-{content_digest(files)}"
     slot = store.Slot(store.folder_of(kind), commit, f"{kind} {name}")
     if store.load_whole(slot) is None:
         store.publish(slot, files, copy, {"repo_type": kind, "repo_id": name})
-        # Every edit leaves a copy; a Hub commit, in contrast, is kept until somebody removes it.
+        # Every edit makes a copy, so old copies are removed; commits of the Hub are kept.
         store.remove_unused(slot.folder, days=_COPIES_DAYS)
     store.mark_used(slot)
     return Snapshot(name, kind, slot.commit, path, slot.tree, files)
@@ -308,7 +311,7 @@ def _by_content(
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A reference read as a repository of one type. Raises ``HubFailure`` and ``SnapshotError``.
+    """A reference, read as a repository of one type. Raises ``HubFailure``, ``SnapshotError``.
     ``public``: see ``fetch``; git has no logins.
     """
 
@@ -321,11 +324,11 @@ class _Candidate:
 
     @property
     def folder(self) -> Path:
-        """Where the repository's commits lie in the store."""
+        """The folder of the repository's commits in the store."""
         return store.repository_folder(self.host.public_endpoint, *self.repo)
 
     def stored(self) -> Snapshot | None:
-        """The pinned commit, if it is in the store. No request. Raises ``HalfDeletedError``."""
+        """The pinned commit if it is in the store, by no request. Raises ``HalfDeletedError``."""
         slot = self._slot(self.ref.revision or "")
         files = store.load(slot)
         hidden = self.public and not store.is_public(slot)
@@ -346,7 +349,7 @@ class _Candidate:
         return self._finished(slot, files)
 
     def _note_whether_public(self, slot: store.Slot) -> bool:
-        """Whether the host gives it to everybody, which the store remembers; git has no logins."""
+        """Find out whether the host gives a commit to everybody; if so, the store remembers it."""
         host = self.host
         public = not isinstance(host, HubClient) or host.is_public(self.repo, slot.commit)
         if public:
@@ -354,7 +357,7 @@ class _Candidate:
         return public
 
     def resolved(self) -> str:
-        """The commit that the revision is at the host now."""
+        """The commit that the revision is at the host now; raises if a pin resolves to another."""
         commit = self.host.resolve(self.repo, self.ref.revision)
         if self.ref.is_pinned and commit != self.ref.revision:
             raise SnapshotIntegrityError(
@@ -365,9 +368,16 @@ class _Candidate:
 
     def _bring(self, slot: store.Slot) -> None:
         with self.host.files(self.repo, slot.commit) as source:
-            # The listing is a stranger's text, so it is judged whole before anything is fetched:
-            # sizes and number while its pages come, then names, before any becomes a path here or
-            # in the cache of the Hub's client; and a mistyped entry file costs no download.
+            # The listing is a stranger's text, so the whole listing is checked before any file is
+            # downloaded:
+            #
+            # 1. Sizes and the number of files, while the pages of the listing come.
+            # 2. Names, before any of them becomes a path here or in the Hub client's cache.
+            # 3. Names that this file system cannot keep apart.
+            # 4. The entry file, so that a mistyped one costs no download.
+            #
+            # Only then the files are downloaded, hashed while they are written, and published by
+            # one rename.
             files = listing_within_limits(source.listing, self.limits, slot.title)
             check_listing_names(files, slot.title)
             store.refuse_clashes(slot, files)
@@ -398,7 +408,7 @@ class _Candidate:
 
 
 def _missing_entry(path: str, files: tuple[FileRecord, ...]) -> tuple[str, str]:
-    """What to say when a repository lacks the entry file: which ``.py`` files there are."""
+    """The text and advice for a missing entry file, with the existing ``.py`` files."""
     names = [file.path for file in files if file.path.endswith(".py")]
     lack = f"has no file {path!r}"
     if not names:

@@ -3,12 +3,12 @@
 ::
 
     <cache>/snapshots/huggingface.co-1f2e3d4c/model--org--repo/<commit>/
-        record.json     what was verified: digests, and a stat fingerprint of each file; and whether
-                        the host gave it without a login
+        record.json     the verified digests, a stat fingerprint of each file, and whether the host
+                        gave it without a login
         tree/           the files, 0444 or 0555, in folders 0555, and nothing else
 
-A snapshot is built in a folder of another name and renamed into place: what bears a commit's
-name is complete. The record lies outside the tree, where the jail never sees it.
+A snapshot is built in a folder of another name and renamed into place, so a folder with a commit's
+name is complete. The record is outside the tree, where the jail never sees it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _PROGRAM_MODE = _TREE_FOLDER_MODE = 0o555
 
 @dataclass(frozen=True)
 class Slot:
-    """The place of one snapshot; ``title`` names it in errors."""
+    """The place of one snapshot in the store; ``title`` names it in errors."""
 
     folder: Path
     commit: str
@@ -54,7 +54,7 @@ class Slot:
 
     @property
     def home(self) -> Path:
-        """The folder that appears at once, by a rename."""
+        """The folder of the snapshot, which appears by one rename."""
         return self.folder / self.commit
 
     @property
@@ -64,12 +64,12 @@ class Slot:
 
     @property
     def record(self) -> Path:
-        """The hashes and fingerprints."""
+        """The file with the hashes and fingerprints."""
         return self.home / "record.json"
 
 
 class StoredCommit(NamedTuple):
-    """A commit in the store: the revision it was asked for by, and the date (UTC) of that."""
+    """A commit in the store, the revision by which it was fetched, and the date (UTC)."""
 
     commit: str
     revision: str | None
@@ -77,16 +77,16 @@ class StoredCommit(NamedTuple):
 
 
 class HalfDeletedError(SnapshotIntegrityError):
-    """Files of a snapshot are missing, and none differs: ``publish`` restores them."""
+    """Files of a snapshot are missing, but none differs; ``publish`` restores it."""
 
 
 def _fingerprint(status: os.stat_result) -> list[int]:
-    """What changes with a file's content."""
+    """The fields of a file's status that change with its content."""
     return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
 
 
 def repository_folder(endpoint: str, repo_type: str, repo_id: str) -> Path:
-    """Where the commits of a repository lie; ``--`` is in no name of the Hub, but in git's."""
+    """The folder of a repository's commits. Names of git may have ``--``, the Hub's cannot."""
     host = re.sub(r"[^A-Za-z0-9.-]", "_", urlsplit(endpoint).netloc.rpartition("@")[2])
     key = hashlib.sha256(endpoint.encode()).hexdigest()[:8]
     name = f"{repo_type}--{repo_id.replace('/', '--')}"
@@ -96,7 +96,7 @@ def repository_folder(endpoint: str, repo_type: str, repo_id: str) -> Path:
 
 
 def folder_of(kind: str) -> Path:
-    """Where copies lie that are named by their content: of local folders, and of packages' ids."""
+    """The folder of snapshots that are named by their content: of local folders and packages."""
     return cache_root() / "snapshots" / kind
 
 
@@ -104,27 +104,27 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
     """The files of a stored snapshot, verified; None if it is not in the store.
 
     Each file's size, times and inode are compared with those recorded when its content was
-    verified, and it is hashed again where they differ. Extra and missing files are noticed.
+    verified; if they differ, the file is hashed again. Extra and missing files are noticed.
 
     Raises:
-        HalfDeletedError: Some of it is gone.
-        SnapshotIntegrityError: The tree is not what was verified; the text says how to remove it.
+        HalfDeletedError: Some files are missing.
+        SnapshotIntegrityError: The tree differs from the record; the text says how to remove it.
     """
     text = _record_of(slot)
     if text is None:
         if not os.path.lexists(slot.home):
             return None
-        text = _record_of(slot)  # another may have put the whole of it there in between
+        text = _record_of(slot)  # another process may have published it in between
         if text is None:
             raise _damaged(slot, "its record.json is missing", HalfDeletedError)
-    with contextlib.suppress(FileNotFoundError):  # which is said below
+    with contextlib.suppress(FileNotFoundError):  # reported below
         _refuse_shared_store(slot.tree)
     document, entries = _read_record(slot, text)
     statuses = dict(_walk(slot, slot.tree, "")) if os.path.lexists(slot.tree) else {}
     recorded = {entry.path for entry in entries}
-    # Whether files are missing is asked last. It alone raises ``HalfDeletedError``, after which
-    # ``publish`` replaces the snapshot without a word; a file that was added or edited must be
-    # refused, also where somebody has deleted another one beside it.
+    # Missing files are checked last. Only they raise ``HalfDeletedError``, after which ``publish``
+    # replaces the snapshot silently. An added or edited file must be refused, even if another file
+    # was deleted as well.
     if extra := sorted(statuses.keys() - recorded):
         raise _damaged(slot, f"the file {extra[0]!r} is extra")
     changed = [
@@ -137,35 +137,35 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
     if missing := sorted(recorded - statuses.keys()):
         raise _damaged(slot, f"the file {missing[0]!r} is missing", HalfDeletedError)
     if changed:
-        with contextlib.suppress(OSError):  # A read-only store only stays slower.
+        with contextlib.suppress(OSError):  # a read-only store hashes the files each time
             _write_record(slot.home, slot.tree, document, entries)
     return tuple(entries)
 
 
 def endpoint_of(tree: Path) -> str:
-    """The endpoint that a stored repository was downloaded from, without a login. Raises
-    ``OSError``, ``ValueError``, ``LookupError``: that is not known.
+    """The endpoint from which a stored repository was downloaded, without a login. Raises
+    ``OSError``, ``ValueError`` or ``LookupError`` if it is not known.
     """
     return str(json.loads((tree.parent / "record.json").read_bytes())["endpoint"])
 
 
 def is_public(slot: Slot) -> bool:
-    """Whether a stored snapshot was once to be had without a login."""
+    """Whether the host gave a stored snapshot without a login once."""
     text = _record_of(slot)
     return text is not None and _read_record(slot, text)[0].get(_PUBLIC) is True
 
 
 def mark_public(slot: Slot) -> None:
-    """Note that a snapshot, which is in the store, is to be had without a login."""
+    """Note that the host gives a stored snapshot without a login."""
     if (text := _record_of(slot)) is not None:
-        # the rest stays: of files that have changed meanwhile nothing is known
+        # the fingerprints stay: files that have changed meanwhile were not verified
         document = {**_read_record(slot, text)[0], _PUBLIC: True}
         with contextlib.suppress(OSError):  # a read-only store asks the host again
             write_whole_file(slot.record, json.dumps(document).encode())
 
 
 def load_whole(slot: Slot) -> tuple[FileRecord, ...] | None:
-    """The same, and None also where parts of it are gone: for who can ``publish`` it again."""
+    """``load``, but None also if files are missing, for a caller who can ``publish`` it again."""
     try:
         return load(slot)
     except HalfDeletedError:
@@ -201,7 +201,7 @@ def _walk(slot: Slot, folder: Path | str, prefix: str) -> Iterator[tuple[str, os
         raise _damaged(slot, f"its folder {prefix or '.'!r} cannot be read ({error})") from error
     with listing:
         for item in listing:
-            status = os.lstat(item.path)  # an entry's own has no inode on Windows
+            status = os.lstat(item.path)  # not item.stat(), which has no inode on Windows
             if not folders.is_trusted(status.st_uid):
                 raise _damaged(slot, f"{prefix + item.name!r} belongs to uid {status.st_uid}")
             if stat.S_ISDIR(status.st_mode):
@@ -245,14 +245,16 @@ def publish(
     copy: Callable[[FileRecord, Path], None],
     note: Mapping[str, object],
 ) -> None:
-    """Lay out the files and rename them into place. A snapshot that is there, whole, wins.
+    """Write the files and rename them into place. A complete snapshot that exists already stays.
 
-    ``copy(record, target)`` writes the target and must raise unless it wrote what the record
-    says. ``note`` is kept in the record (where the snapshot is from). Nothing stays if it fails.
+    ``copy(record, target)`` writes the target, and must raise if the bytes are not the recorded
+    ones. ``note`` is kept in the record and says where the snapshot is from. After a failure
+    nothing stays.
     """
     refuse_clashes(slot, files)
-    # All is written into a draft, the record last, and one rename makes the snapshot: a process
-    # that is killed before it leaves a draft, which goes after a day, and nothing to be believed.
+    # The order matters: the files are written into a draft, then the record, and one rename makes
+    # the snapshot. A process that is killed before the rename leaves only a draft, which is
+    # removed after a day and never taken for a snapshot.
     try:
         folders.make(slot.folder)
         _refuse_shared_store(slot.folder)
@@ -266,7 +268,7 @@ def publish(
             _write_record(building, tree, document, files)
             building.chmod(folders.SHARED_MODE)
             with _opened(slot.folder) as handle:
-                # one at a time: no process moves away what another has just put there
+                # one process at a time, or one could move away what another has just published
                 with contextlib.suppress(OSError):  # not every file system has locks
                     locks.lock(handle, wait=True)
                 _move_remains(slot)
@@ -276,8 +278,8 @@ def publish(
 
 
 def refuse_clashes(slot: Slot, files: Iterable[FileRecord]) -> None:
-    """Refuse files that the store's file system would keep as one, which differ in case alone.
-    Raises ``SnapshotError``: with their names and what to do.
+    """Refuse files whose names the store's file system cannot keep apart, such as by their case.
+    Raises ``SnapshotError``, with their names and what to do.
     """
     clash = platform.taken_as_one(file.path for file in files)
     if clash is None:
@@ -304,7 +306,7 @@ def _unwritable(slot: Slot, error: OSError) -> SnapshotError:
 
 @contextlib.contextmanager
 def _opened(folder: Path) -> Iterator[int]:
-    if IS_WINDOWS:  # which opens no folder, and so has no lock of one
+    if IS_WINDOWS:  # Windows cannot open a folder, so it cannot lock one
         yield -1
         return
     handle = os.open(folder, os.O_RDONLY | open_flags("O_DIRECTORY", "O_CLOEXEC"))
@@ -315,8 +317,8 @@ def _opened(folder: Path) -> Iterator[int]:
 
 
 def _move_remains(slot: Slot) -> None:
-    """Make room, where a snapshot is half deleted. Jails that have it open keep what they have:
-    it is removed a day later, with what was never finished.
+    """Move a half deleted snapshot aside. Jails that use it keep its files: it is removed a day
+    later, like an abandoned draft.
     """
     try:
         load(slot)
@@ -328,7 +330,7 @@ def _move_remains(slot: Slot) -> None:
 
 
 def remove(home: Path) -> dict[int, str]:
-    """Remove a snapshot, unless others use it (share a lock of its folder); these are returned."""
+    """Remove a snapshot unless processes use it (share a lock of its folder); returns these."""
     with contextlib.suppress(FileNotFoundError), _opened(home) as handle:
         try:
             if handle >= 0:
@@ -340,7 +342,7 @@ def remove(home: Path) -> dict[int, str]:
 
 
 def remove_unused(folder: Path, days: float) -> None:
-    """Remove snapshots that were not asked for in that many days (see ``mark_used``)."""
+    """Remove snapshots that were not used for so many days (see ``mark_used``)."""
     for record in _older(folder.glob("*/record.json"), days * 24 * 3600):
         with contextlib.suppress(OSError):
             remove(record.parent)
@@ -354,13 +356,13 @@ def _older(paths: Iterable[Path], seconds: float) -> Iterator[Path]:
 
 
 def mark_used(slot: Slot) -> None:
-    """Note that a snapshot was asked for now."""
+    """Note that a snapshot is used now."""
     with contextlib.suppress(OSError):
         os.utime(slot.record)
 
 
 def _refuse_shared_store(store: Path) -> None:
-    """A user who can write there can put both a tree and a record that vouches for it."""
+    """Raise if another user can write there, and so could forge a tree with its record."""
     root = cache_root()
     try:
         why = folders.why_distrusted(store, root)
@@ -409,12 +411,12 @@ def _rename(building: Path, home: Path) -> None:
     try:
         os.rename(building, home)
     except OSError as error:
-        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):  # another has put it there first
+        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):  # another process was faster
             raise
 
 
 def commits(folder: Path) -> list[StoredCommit]:
-    """The commits of a repository in the store, the latest fetched first. Nothing is verified."""
+    """The commits of a repository in the store, the last fetched first. Verifies nothing."""
     commits = []
     for record in folder.glob("[!.]*/record.json"):
         with contextlib.suppress(OSError, ValueError):
