@@ -1,1 +1,1 @@
-"""What several packages ask of the operating system: locks, files, folders, processes."""
+"""The operating system, for several packages: locks, files, folders, processes, threads."""

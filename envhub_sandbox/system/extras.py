@@ -1,4 +1,4 @@
-"""Extras by their names: the core imports none, and does without one that is not installed."""
+"""Finds extras by name. The core imports no extra, and works without those not installed."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from envhub_sandbox.errors import SandboxUnavailableError
 
 
 def find(module: str, name: str) -> Any:
-    """What an extra's module calls so; None if this installation lacks the module."""
+    """An attribute of an extra's module; None if this installation lacks the module."""
     try:
         return getattr(importlib.import_module(module), name)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # the module is there, and lacks something itself
+            raise  # the module exists, and one of its own imports is missing
         return None
 
 
 def required(module: str, name: str, what: str, instead: str = "leave that out") -> Any:
-    """The same for what a caller has asked for. Raises ``SandboxUnavailableError``: it lacks it."""
+    """``find`` for a caller's request. Raises ``SandboxUnavailableError``: it is missing."""
     extra = find(module, name)
     if extra is None:
         raise SandboxUnavailableError(

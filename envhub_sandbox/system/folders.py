@@ -1,10 +1,10 @@
-"""Our folders and files on disk, and the user's cache folder that most of them lie in.
+"""Our folders and files on disk, and the user's cache folder, which has most of them.
 
-Folders are made with the modes that are meant, and believed where only we can write. The umask says
-nothing about them: under 0 it would let others in, under 077 it would keep a worker of another user
-out. It belongs to the whole process, so it is never changed here. On Windows a mode says only
-whether a file can be written; whose it is, and who else may write it, its access list says, which
-it inherits: what lies in a user's own folders is that user's.
+Folders get explicit modes, whatever the umask is, and are trusted only if no other user can write
+in them. A umask of 0 would let others in, and 077 would keep a worker of another user out. The
+umask belongs to the whole process, so it is never changed here. On Windows a mode says only whether
+a file can be written. Its access list, which it inherits, says who owns and who may write it: files
+in a user's own folders belong to that user.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ _ACL = "system.posix_acl_access"
 
 
 def make(folder: Path, mode: int = SHARED_MODE) -> None:
-    """Make a folder, and those above it that are missing (0755), whatever the umask is.
+    """Make a folder, and missing folders above it (0755), whatever the umask is.
 
-    One that is there keeps its mode.
+    An existing folder keeps its mode.
     Raises ``OSError``: it cannot be made.
     """
     missing = []
@@ -62,8 +62,8 @@ def _make_one(path: Path, mode: int) -> None:
 
 
 def make_private(folder: Path) -> None:
-    """The same for a folder that is ours alone; one that is there becomes it.
-    Raises ``OSError``: it cannot be made, or is somebody else's.
+    """Make a folder that only we can use; an existing folder gets this mode, too.
+    Raises ``OSError``: it cannot be made, or belongs to another user.
     """
     make(folder, PRIVATE_MODE)
     if stat.S_IMODE(folder.stat().st_mode) != PRIVATE_MODE:
@@ -80,16 +80,16 @@ def write_private(path: Path, content: bytes) -> None:
 
 
 def why_distrusted(folder: Path, ours: Path) -> str:
-    """Who besides us and root can change what lies at a place, and what to do; empty if none can.
+    """Which user besides us and root can change a path, with advice; empty if none can.
 
-    Every step of the path counts, links and what they lead to included: a user who can write in
-    a folder can put another one in the place of what is in it. In a sticky folder, such as /tmp,
-    only its owner can, so there it counts whose the next step is. A POSIX access list shows in
-    the group's bits, which are its mask.
+    Every step of the path is checked, also links and their targets, because a user who can write in
+    a folder can replace its entries. In a sticky folder, such as /tmp, only the owner of an entry
+    can replace it, so there the owner of the next step is checked. The group bits show a POSIX
+    access list, whose mask they are.
     ``place``: an existing absolute path.
-    ``ours``: where the folders begin that we made: no other user may write there. Above, the group
-    may write if it is its user's own, as many systems set homes up.
-    Raises ``OSError``: a step cannot be looked at.
+    ``ours``: the topmost folder that we made: in it no other user may write. Above it the group may
+    write if it is the user's own group, as many systems configure home directories.
+    Raises ``OSError``: the status of a step cannot be read.
     """
     if IS_WINDOWS:
         folder.stat()
@@ -104,7 +104,7 @@ def why_distrusted(folder: Path, ours: Path) -> str:
 
 
 def _steps(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
-    """Each step of a path from the root on; a link, and then each step of what it leads to."""
+    """Yield each step of a path from the root on; after a link, each step of its target."""
     left, current, links = list(reversed(folder.parts[1:])), "/", 0
     yield current, os.lstat(current)
     while left:
@@ -146,26 +146,26 @@ def _fault(path: str, status: os.stat_result, strict: bool) -> str:
 
 
 def is_ours_alone(folder: Path) -> bool:
-    """Whether only its owner, who is us or root, can write in a folder. Raises ``OSError``."""
+    """Whether only the owner can write in a folder, and is us or root. Raises ``OSError``."""
     status = folder.stat()
     return is_trusted(status.st_uid) and not others_write(status)
 
 
 def others_write(status: os.stat_result) -> bool:
-    """Whether users beside the owner can write a file, or in a folder."""
+    """Whether users other than the owner can write a file, or in a folder."""
     return not IS_WINDOWS and bool(status.st_mode & _OTHERS_WRITE)
 
 
 def is_trusted(user: int) -> bool:
     """Whether a user could change our files anyway: ourselves, root, and the owner of ``/``.
 
-    The last is root, as it looks from inside a user namespace. On Windows all have the number 0.
+    The owner of ``/`` is root, as seen in a user namespace. On Windows all users have the number 0.
     """
     return user in (0, user_id()) or user == os.lstat("/").st_uid
 
 
 def _is_own_group(path: str, status: os.stat_result) -> bool:
-    """Whether a group is that of one user, who is us, and no access list adds others."""
+    """Whether a group has only us as a member, and no access list adds other users."""
     if user_id() == 0 or _has_access_list(path):
         return False
     is_own = False
@@ -206,9 +206,9 @@ _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | open_flags("O_CLOEXEC")
 
 
 def write_whole_file(path: Path, data: bytes, *, mode: int = 0o600) -> None:
-    """Write a file under another name, and rename it: meanwhile others read the old one.
-    ``mode``: its mode; the umask takes from it.
-    Raises ``OSError``: it cannot be written. Nothing is left of it.
+    """Write a file under another name, and rename it, so that readers never see a part of it.
+    ``mode``: the file's mode, reduced by the umask.
+    Raises ``OSError``: it cannot be written; nothing is left of it.
     """
     part = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
     descriptor = os.open(part, _NEW, mode)
@@ -229,7 +229,7 @@ _MAX_TEXT_BYTES = 16 * 1024 * 1024
 
 def cache_root() -> Path:
     """``$ENVHUB_CACHE``, or the user's cache folder for ``envhub-sandbox``.
-    Raises ``SnapshotError``: the user has none.
+    Raises ``SnapshotError``: the user has no home folder.
     """
     chosen = os.environ.get(CACHE_VARIABLE)
     if chosen:
@@ -246,7 +246,7 @@ def cache_root() -> Path:
 
 @contextlib.contextmanager
 def draft(folder: Path, prefix: str = BUILDING) -> Iterator[Path]:
-    """A new folder (0700) to be filled and then renamed into place; otherwise it is removed."""
+    """Make a folder (0700) to fill and rename; it is removed unless the caller renames it."""
     draft_folder = Path(tempfile.mkdtemp(prefix=prefix, dir=folder))
     try:
         yield draft_folder
@@ -255,12 +255,12 @@ def draft(folder: Path, prefix: str = BUILDING) -> Iterator[Path]:
 
 
 def remove_tree(path: Path) -> None:
-    """Remove a folder of the cache, whose own folders are read-only; nothing if it is gone.
+    """Remove a folder of the cache, with its read-only folders; no error if it does not exist.
 
-    Without recursion, as ``shutil.rmtree`` has it: of a package, a stranger chose how deep it is.
+    Unlike ``shutil.rmtree`` it does not recurse, since a stranger chose how deep a package is.
     """
     waiting = [] if path.is_symlink() else [str(path)]
-    for folder in waiting:  # which grows
+    for folder in waiting:  # the loop appends to it
         with contextlib.suppress(OSError):
             os.chmod(folder, 0o700)
             with os.scandir(folder) as items:
@@ -270,14 +270,14 @@ def remove_tree(path: Path) -> None:
             for name in os.listdir(folder):
                 with contextlib.suppress(OSError):
                     file = os.path.join(folder, name)
-                    if IS_WINDOWS:  # which removes no file that cannot be written
+                    if IS_WINDOWS:  # Windows cannot remove a read-only file
                         os.chmod(file, PRIVATE_MODE)
                     os.unlink(file)
             os.rmdir(folder)
 
 
 def recall(folder: Path, key: str) -> str | None:
-    """A text that ``keep`` wrote; None if it is not there, or others could have written it."""
+    """A text that ``keep`` wrote; None if there is none, or another user could have written it."""
     path = folder / key
     try:
         if not is_ours_alone(folder) or path.stat().st_size > _MAX_TEXT_BYTES:
@@ -288,7 +288,7 @@ def recall(folder: Path, key: str) -> str | None:
 
 
 def keep(folder: Path, key: str, text: str) -> None:
-    """Remember a text. A cache that cannot be written is no error."""
+    """Write a text for ``recall``. Failing to write the cache is no error."""
     with contextlib.suppress(OSError):
         make_private(folder)
         write_whole_file(folder / key, text.encode())

@@ -1,10 +1,10 @@
-"""Locks on files. The kernel gives a lock back when its holder ends, whatever ended it.
+"""Locks on files, which the kernel releases when their holder ends for any reason.
 
-All are ``flock``. Such a lock belongs to the open file description, and not to a process: a child
-that is given the descriptor holds the lock on, and so would a fork, which therefore closes its
-copies. A pid, or a start time, would say nothing in another namespace; a lock does.
+All are ``flock``. Such a lock belongs to the open file description, not to a process: a child that
+inherits the descriptor keeps the lock held, and a fork would, too, so it closes its copies. Unlike
+a pid or a start time, a lock also has a meaning in another namespace.
 
-Windows locks bytes of a file, for its holder alone: a shared lock is none there.
+Windows locks bytes of a file exclusively, so a shared lock does nothing there.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ else:
 _POLL_S = 0.1
 _COMMAND_CHARS = 80
 _LOOKS = 5
-"""The kernel gives the list of locks a page at a time, and skips some where others change it."""
+"""How often to read the list of locks: the kernel gives it page by page, and may skip some when
+others change it."""
 _READ = os.O_RDONLY | open_flags("O_NONBLOCK", "O_NOFOLLOW", "O_CLOEXEC")
 _WRITE = os.O_RDWR | os.O_CREAT | open_flags("O_NOFOLLOW", "O_CLOEXEC")
 _LOCKED_BYTE = 1 << 30
-"""On Windows, where what is locked cannot be read: far behind the end of every file of ours."""
+"""The byte to lock on Windows, where locked bytes cannot be read: beyond the end of our files."""
 
 
 def lock(descriptor: int, *, shared: bool = False, wait: bool = False) -> None:
-    """Take the lock of an open file. Raises ``BlockingIOError``: another has it, and there is no
-    ``wait``; ``OSError``: its file system has no locks.
+    """Take the lock of an open file. Raises ``BlockingIOError``: another process has it, and
+    ``wait`` is False; ``OSError``: its file system has no locks.
     """
     if sys.platform == "win32":
         if not shared:
@@ -47,7 +48,7 @@ def lock(descriptor: int, *, shared: bool = False, wait: bool = False) -> None:
 
 
 def unlock(descriptor: int) -> None:
-    """Give it back, also where a fork has a copy of the descriptor, which would hold it on."""
+    """Release the lock, even if a fork has a copy of the descriptor, which would keep it held."""
     if sys.platform == "win32":
         _lock_byte(descriptor, msvcrt.LK_UNLCK)
     else:
@@ -74,18 +75,18 @@ def held(
     on_wait: Callable[[], object] = lambda: None,
     mode: int = 0o600,
 ) -> Iterator[int]:
-    """Hold the lock of a file, which is made if it is missing. Gives its descriptor.
+    """Hold the lock of a file, which is made if it does not exist. Yields its descriptor.
 
     A child that inherits the descriptor keeps the lock only until this context ends. The holder
-    may remove the file: the next one makes another.
+    may remove the file; the next holder then makes a new one.
 
     Args:
-        wait_s: For how long to wait while another holds it.
+        wait_s: How long to wait while another process holds it.
         on_wait: Called once before the first wait.
-        mode: That of a new file.
+        mode: The mode of a new file.
 
-    Raises ``TimeoutError``: another holds it; ``OSError``: it cannot be opened, or its file system
-    has no locks.
+    Raises ``TimeoutError``: another process holds it; ``OSError``: the file cannot be opened, or
+    its file system has no locks.
     """
     until = time.monotonic() + wait_s
     waits = False
@@ -104,7 +105,7 @@ def held(
 
 
 def _take(path: Path, mode: int) -> int | None:
-    """Take it now; None if another has it, or has just removed the file."""
+    """Take the lock now; None if another process has it, or has just removed the file."""
     descriptor = os.open(path, _WRITE, mode)
     try:
         lock(descriptor)
@@ -120,9 +121,9 @@ def _take(path: Path, mode: int) -> int | None:
 
 
 def is_held(path: Path) -> bool:
-    """Whether another, in whatever namespace, holds a lock that is not shared.
-    Raises ``FileNotFoundError``: there is no such file; ``OSError``: the file cannot be opened, or
-    its file system has no locks.
+    """Whether a process, in any namespace, holds the file's lock exclusively.
+    Raises ``FileNotFoundError``: the file does not exist; ``OSError``: it cannot be opened, or its
+    file system has no locks.
     """
     with unheld(path) as free:
         return not free
@@ -130,7 +131,7 @@ def is_held(path: Path) -> bool:
 
 @contextlib.contextmanager
 def unheld(path: Path) -> Iterator[bool]:
-    """The opposite of ``is_held``; in this context the lock is not taken. Raises likewise."""
+    """Whether the lock is free; nobody can take it within this context. Raises as ``is_held``."""
     descriptor = os.open(path, _READ)
     try:
         lock(descriptor, shared=sys.platform != "win32")
@@ -155,23 +156,23 @@ class _HeldLock:
     def __init__(self) -> None:
         self._held: list[int] = []
         _locks.add(self)
-        # interruption.md, rule 5: also where a Ctrl-C came into ``release``
+        # interruption.md, rule 5: also if a Ctrl-C has interrupted ``release``
         weakref.finalize(self, _close, self._held).atexit = False
 
     def release(self) -> None:
-        """Give it back. Idempotent, and nothing in a fork."""
+        """Release the lock. Idempotent. In a fork, only close the copy of its descriptor."""
         _close(self._held)
 
 
 class LifeLock(_HeldLock):
-    """A new file whose lock this process holds: under its name it is never seen without.
+    """A new file whose lock this process holds; it gets its name only when it is locked.
 
-    Where the file system has no locks, ``is_held`` cannot tell, and says so.
+    If the file system has no locks, ``is_held`` raises.
     """
 
     def __init__(self, path: Path, content: str = "") -> None:
         super().__init__()
-        # Windows renames no open file
+        # Windows cannot rename an open file
         new = path if sys.platform == "win32" else path.with_name(f".{path.name}")
         self._held.append(os.open(new, _WRITE | os.O_EXCL, 0o600))
         with contextlib.suppress(OSError):
@@ -182,9 +183,9 @@ class LifeLock(_HeldLock):
 
 
 class SharedLock(_HeldLock):
-    """A file's lock that this process shares with others who use the file; see ``sharers``.
+    """A file's lock that this process shares with others that use the file; see ``sharers``.
 
-    Nothing is held where there is no such file, or another has it alone.
+    Nothing is held if the file does not exist or another process holds the lock exclusively.
     """
 
     def __init__(self, path: Path) -> None:
@@ -195,8 +196,8 @@ class SharedLock(_HeldLock):
 
 
 def sharers(path: Path) -> dict[int, str]:
-    """The processes that hold the lock of a file, as far as they are seen from here: pid to the
-    first words of the command line; none where the kernel has no list of locks.
+    """The processes that hold the lock of a file, as far as this namespace shows them: from the pid
+    to the beginning of the command line. Empty if the kernel has no list of locks.
     """
     if sys.platform != "linux":
         return {}

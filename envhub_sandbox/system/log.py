@@ -1,14 +1,14 @@
-"""What is said of work while it goes on: our part of the ``logging`` tree, and progress lines.
+"""Reports on running work: our part of the ``logging`` tree, and progress lines.
 
-The loggers are silent until the application that uses us sets them up. ``envhub_sandbox.worker``
+The loggers are silent until the application configures them. ``envhub_sandbox.worker``
 logs jails: opened, closed (DEBUG), died, timed out, restarted (INFO).
 ``envhub_sandbox.worker.output`` has every line that they print (DEBUG). ``envhub_sandbox.snapshot``
 logs downloads, ``envhub_sandbox.dependencies`` packages, ``envhub_sandbox.crashes``
-crash bundles. ``envhub_sandbox.errors`` has our own frames of what is raised, and
-``envhub_sandbox.messages`` the names of messages to and from a server, no values (DEBUG).
+crash bundles. ``envhub_sandbox.errors`` has the full tracebacks of errors, and
+``envhub_sandbox.messages`` the names of messages to and from a server, without values (DEBUG).
 
-Progress is shown on a terminal or in a notebook, for what takes a moment, such as packages.
-Elsewhere (in CI, under a program) there is the log.
+Progress of slow work, such as making packages, is shown on a terminal or in a notebook. Elsewhere
+(in CI, under a program) only the log has it.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _told_by: list[Callable[[str], None]] = []
 
 @contextlib.contextmanager
 def progress_shown_by(show: Callable[[str], None]) -> Iterator[None]:
-    """While it lasts, progress goes to ``show``, which has the terminal already."""
+    """Within this context, pass progress lines to ``show``, which uses the terminal already."""
     _shown_by.append(show)
     try:
         yield
@@ -51,7 +51,7 @@ def progress_shown_by(show: Callable[[str], None]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def told_by(show: Callable[[str], None]) -> Iterator[None]:
-    """While it lasts, what users have to know goes to ``show``, too; each line once."""
+    """Within this context, pass lines of ``tell`` to ``show``, too, each line once."""
     names: set[str] = set()
 
     def once(line: str) -> None:
@@ -67,7 +67,7 @@ def told_by(show: Callable[[str], None]) -> Iterator[None]:
 
 
 def tell(line: str, log: logging.Logger) -> None:
-    """Log what users have to know."""
+    """Log a line that users have to know, and show it."""
     log.info("%s", line)
     for show in _told_by[-1:]:
         show(line)
@@ -77,7 +77,7 @@ def tell(line: str, log: logging.Logger) -> None:
 def progress_shown(
     title: str, log: logging.Logger = DEPENDENCIES
 ) -> Iterator[Callable[[str], None]]:
-    """Gives what takes a line for each thing that happens."""
+    """Yields a function that logs a line of progress, and shows it."""
     with contextlib.ExitStack() as stack:
         shows = list(_shown_by[-1:])
         console = None if shows else _console()
@@ -96,7 +96,7 @@ def progress_shown(
 
 
 def _console() -> Console | None:
-    """A console that somebody looks at."""
+    """A console on stderr if a user sees it: on a terminal or in a notebook, not in CI."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     is_notebook = type(shell).__name__ == "ZMQInteractiveShell"
     looked_at = sys.stderr is not None and sys.stderr.isatty()

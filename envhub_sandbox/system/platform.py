@@ -1,20 +1,19 @@
-"""What differs between Linux, macOS and Windows; processes of ours, and how they end.
+"""The differences between Linux, macOS and Windows; our processes and their ends; file names.
 
-This is the one place that asks which of them this is.
+Only this module checks which of these systems it runs on.
 
-Jails need Linux. A client of a server on another host, or of a container, needs nothing of it, so
-what Linux alone has is asked for here, with what stands in for it elsewhere.
+Jails need Linux. A client of a server on another host or in a container runs on any system, so this
+module has substitutes for features that only Linux has.
 
-``OwnerProcess`` is docs/internals/interruption.md, rule 14. A parent hands its child a pidfd of
-itself, which the child watches, or on macOS a pipe that ends with it. The kernel's own signal at a
-parent's death would come when the thread ends that started the child, and a change of user forgets
-it. Windows hands no descriptors on, and has none of this.
+``OwnerProcess`` is for docs/internals/interruption.md, rule 14. A parent passes its child a pidfd
+of itself, or on macOS a pipe that closes when the parent ends; the child watches it. The kernel's
+parent death signal would not do: it comes when the thread ends that started the child, and a change
+of user clears it. Windows cannot pass descriptors, so it has none of this.
 
-Names of files differ, too. A repository is made on Linux, where a name is bytes. On Windows
-``C:\\x`` is no name but a place outside of the folder, ``env.py:x`` a part of ``env.py``,
-``con.py`` a terminal and ``env.py.`` the file ``env.py``. macOS and Windows take ``Env.py`` and
-``env.py`` for one file, unless the file system was made otherwise, and so do some file systems on
-Linux.
+File names differ, too. Repositories are made on Linux, where a name is any bytes. On Windows
+``C:\\x`` is a path outside of the folder, ``env.py:x`` a stream of ``env.py``, ``con.py`` a
+terminal and ``env.py.`` the file ``env.py``. On most file systems of macOS and Windows, and some of
+Linux, ``Env.py`` and ``env.py`` are the same file.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ _WINDOWS_VARIABLES = (
 
 
 def user_id() -> int:
-    """The effective user's id; -1 on Windows, which has none."""
+    """The effective user's id; -1 on Windows, which has no user ids."""
     number = -1
     if sys.platform != "win32":
         number = os.geteuid()
@@ -57,8 +56,8 @@ def user_id() -> int:
 
 
 def homes_of(path: Path) -> list[Path]:
-    """The home directories of the caller and of whom a file or folder belongs to, without links;
-    Windows does not say it of others.
+    """The home directories, without links, of the caller and of the owner of a path; on Windows
+    only the caller's.
     """
     homes = [os.path.expanduser("~")]
     if sys.platform != "win32":
@@ -66,12 +65,12 @@ def homes_of(path: Path) -> list[Path]:
 
         with contextlib.suppress(KeyError, OSError):  # a container knows few of its users
             homes.append(pwd.getpwuid(os.stat(path).st_uid).pw_dir)
-    # of whom nothing is known it is a bare "~"
+    # without a known home it is a bare "~"
     return [Path(os.path.realpath(home)) for home in homes if os.path.isabs(home)]
 
 
 def cores() -> int:
-    """How many processors this process may use."""
+    """The number of processors that this process may use."""
     count = os.cpu_count() or 1
     if sys.platform == "linux":
         count = len(os.sched_getaffinity(0))
@@ -79,7 +78,7 @@ def cores() -> int:
 
 
 def boot_id() -> str:
-    """What differs each time the kernel starts; a word where it does not say."""
+    """An id that differs after each boot of the kernel; ``"unknown"`` if there is none."""
     try:
         with open("/proc/sys/kernel/random/boot_id", encoding="ascii") as file:
             return file.read().strip()
@@ -102,13 +101,13 @@ def own_variables() -> dict[str, str]:
 
 
 def run_after_fork(function: Callable[[], object]) -> None:
-    """Have each fork of this process call a function first; Windows forks none."""
+    """Have each fork of this process call a function first; Windows has no forks."""
     if sys.platform != "win32":
         os.register_at_fork(after_in_child=function)
 
 
 def each_after_fork(objects: Iterable[T], function: Callable[[T], object]) -> None:
-    """The same of each object that there is then."""
+    """Have each fork of this process call a function for each object that exists then."""
 
     def forked() -> None:
         for instance in list(objects):
@@ -118,36 +117,36 @@ def each_after_fork(objects: Iterable[T], function: Callable[[T], object]) -> No
 
 
 def own_group() -> dict[str, Any]:
-    """For ``subprocess.Popen``: a process to which a terminal sends no Ctrl-C."""
+    """Arguments for ``subprocess.Popen``, for a process to which a terminal sends no Ctrl-C."""
     how: dict[str, Any] = {"start_new_session": True}
     if sys.platform == "win32":
-        import subprocess  # for Windows only: every command would pay for it
+        import subprocess  # imported late, as only Windows needs it and it is slow
 
         how = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     return how
 
 
 def kill_group(process: subprocess.Popen[Any]) -> None:
-    """End a process that was started by ``own_group``, and with it its group where there is one."""
+    """Kill a process that was started with ``own_group``, and its group on POSIX systems."""
     if sys.platform == "win32":
         process.kill()
     else:
         try:
             os.killpg(process.pid, signal.SIGKILL)
         except ProcessLookupError:
-            return  # it has ended, and all that it had started
+            return  # the whole group has ended
 
 
 # --- processes of ours
 
 _STREAMS = 3
 _pipe: list[int] = []
-"""Of a process without a pidfd of itself: both ends, of which it alone has the second."""
+"""Both ends of a pipe, where there are no pidfds; only this process keeps the second end open."""
 
 
 class OwnerProcess:
-    """The process that made this.
-    ``pid``: its number. Where each step asks, this is compared without a call.
+    """The process that made this object.
+    ``pid``: its number; compared directly where speed matters.
     """
 
     def __init__(self) -> None:
@@ -155,12 +154,12 @@ class OwnerProcess:
 
     @property
     def is_here(self) -> bool:
-        """Whether it is this one, and no fork of it."""
+        """Whether this process is the owner, and not a fork of it."""
         return os.getpid() == self.pid
 
 
 def fork_error_text(owner: int | None = None) -> str:
-    """The text of the error of an environment that is used in a fork of its owner."""
+    """The error's text when an environment is used in a fork of its owner."""
     whose = "this environment belongs to another process"
     if owner is not None:
         whose = f"this environment belongs to process {owner}"
@@ -169,9 +168,9 @@ def fork_error_text(owner: int | None = None) -> str:
 
 @contextlib.contextmanager
 def pidfd() -> Iterator[int]:
-    """A pidfd of this process, for one that is started meanwhile with it in ``pass_fds``.
+    """Yields a pidfd of this process, for a child that is started with it in ``pass_fds``.
 
-    Where there are none it is a pipe, of which the end comes with that of this process.
+    Without pidfds it is a pipe, which reaches its end when this process ends.
     """
     if sys.platform == "linux":
         ourselves = os.pidfd_open(os.getpid())
@@ -185,7 +184,7 @@ def pidfd() -> Iterator[int]:
 
 
 def _forget_pipe() -> None:
-    """A fork would keep it open, and is told of its own by another."""
+    """In a fork, close the parent's pipe, which the fork would keep open; it makes its own."""
     while _pipe:
         os.close(_pipe.pop())
 
@@ -195,8 +194,8 @@ if not IS_LINUX:
 
 
 def program(module: str) -> list[str]:
-    """The command that runs a module of ours: this very code, which need not be installed, as in a
-    checkout. Neither the working directory nor a variable adds to what it may import.
+    """The command that runs a module of ours from this very code, which may be a checkout. The
+    working directory and environment variables add nothing to its import path.
     """
     packages = Path(__file__).parents[1], Path(protocol.__file__).parents[1]
     folders = sorted({str(package.parent) for package in packages})
@@ -208,19 +207,19 @@ def program(module: str) -> list[str]:
 
 
 def readable_within(fd: int, timeout_s: float) -> bool:
-    """Whether there is something to read, or the other end has gone; waits for it."""
+    """Wait until there is something to read or the other end is closed; returns whether."""
     if sys.platform == "win32":
         return bool(select.select([fd], [], [], timeout_s)[0])
-    poll = select.poll()  # of descriptors beyond 1023, too
+    poll = select.poll()  # select() fails for descriptors above 1023
     poll.register(fd, select.POLLIN)
     return bool(poll.poll(timeout_s * 1000))
 
 
 def end_with(parent: int, patience_s: float) -> None:
-    """End this process as soon as another has ended, and with it the group that it leads.
-    ``parent``: a pidfd of the other.
-    ``patience_s``: for what SIGTERM does here, in the main thread, before all are killed; with none
-    they are killed at once.
+    """End this process, and the group that it leads, as soon as another process has ended.
+    ``parent``: a pidfd of the other process.
+    ``patience_s``: how long SIGTERM's handler in the main thread may take before the group is
+    killed; with 0 it is killed at once.
     """
     os.set_inheritable(parent, False)
     threading.Thread(target=_watch, args=(parent, patience_s), daemon=True).start()
@@ -231,7 +230,7 @@ def _watch(parent: int, patience_s: float) -> None:
         while not readable_within(parent, 3600.0):
             pass
         if patience_s > 0:
-            # of all threads the one whose system call it has to interrupt
+            # to the main thread, whose system call it has to interrupt
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
             time.sleep(patience_s)
         if os.getpgrp() == os.getpid():
@@ -240,28 +239,28 @@ def _watch(parent: int, patience_s: float) -> None:
 
 
 def has_ended(pid: int) -> bool:
-    """Whether a child has ended, reaped or not. It is a zombie before its threads are gone."""
+    """Whether a child has ended, reaped or not, even while some of its threads still end."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
     except OSError:
         return True
-    # the command may hold anything, parentheses and blanks included
+    # the command's name may have any characters, also parentheses and blanks
     return stat.rpartition(")")[2].split()[0] in "ZX"
 
 
 def occupy_streams() -> None:
-    """Take the numbers 0, 1 and 2, where a program was started without them: ``<&- >&- 2>&-``.
+    """Open the descriptors 0, 1 and 2 if the program was started without them: ``<&- >&- 2>&-``.
 
-    Else our first sockets and pipes would have them: what anybody prints would go to a worker, and
-    what a worker is handed would be closed there in favour of its own standard streams.
+    Otherwise our first sockets and pipes would get these numbers: prints would go to a worker, and
+    a child would lose a descriptor that it is passed to its own standard streams.
     """
-    while (null := os.open(os.devnull, os.O_RDWR)) < _STREAMS:  # the lowest that is free
+    while (null := os.open(os.devnull, os.O_RDWR)) < _STREAMS:  # the lowest free number
         os.set_inheritable(null, True)
     os.close(null)
 
 
 def replace_missing_streams() -> None:
-    """Occupy the numbers, and let ``print`` and others find a stream: for a program of ours."""
+    """``occupy_streams``, and give ``sys`` its streams, so that ``print`` works in our programs."""
     occupy_streams()
     sys.stdin = sys.stdin or open(os.devnull)  # noqa: SIM115
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
@@ -277,7 +276,7 @@ _REFUSED = r'[<>:"|?*\\\x00-\x1f]'
 
 
 def wrong_on_windows(path: str) -> str | None:
-    """Why Windows has no file of this name, as the rest of a sentence; None if it can.
+    """Why Windows cannot have a file of this name, as the rest of a sentence; None if it can.
     ``path``: relative, with ``/``.
     """
     for step in path.split("/"):
@@ -291,12 +290,12 @@ def wrong_on_windows(path: str) -> str | None:
 
 
 def wrong_here(path: str) -> str | None:
-    """The same on Windows; None elsewhere."""
+    """``wrong_on_windows`` on Windows; None elsewhere."""
     return wrong_on_windows(path) if IS_WINDOWS else None
 
 
 def taken_as_one(paths: Iterable[str]) -> tuple[str, str] | None:
-    """Two of these, or of the folders above them, that a file system without case takes for one."""
+    """Two paths, or folders above them, that differ only in their case; None if there are none."""
     taken: dict[str, str] = {}
     for path in paths:
         folded = name = ""
@@ -313,9 +312,9 @@ def _folded(step: str) -> str:
 
 
 def ignores_case(folder: Path) -> bool:
-    """Whether the file system of a folder takes two names that differ in case for one.
+    """Whether the file system of a folder ignores the case of names.
 
-    Found out with a file of ours, for a platform has file systems of both kinds.
+    It is tried with a file of ours, since each platform has file systems of both kinds.
     Raises ``OSError``: the folder cannot be written.
     """
     probe = folder / f".envhub-case-{os.urandom(4).hex()}"

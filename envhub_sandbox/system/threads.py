@@ -1,4 +1,4 @@
-"""Calls side by side, in threads that nothing has to wait for."""
+"""Parallel calls in daemon threads, which nothing has to wait for."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Call(Generic[T]):
 
     Attributes:
         done: Whether it has returned or raised.
-        value: What it returned; None before that, and where it raised.
-        error: What it raised.
+        value: Its result; None before it has returned, or if it raised.
+        error: The exception that it raised, or None.
     """
 
     def __init__(self, call: Callable[[], T], finished: queue.SimpleQueue[None]) -> None:
@@ -31,13 +31,13 @@ class Call(Generic[T]):
         self._call, self._finished = call, finished
 
     def result(self) -> T:
-        """What it returned; raises what it raised. Once it is done."""
+        """Return its result or raise its exception, once it is done."""
         if self.error is not None:
             raise self.error
         return cast("T", self.value)
 
     def run(self) -> None:
-        """In a thread."""
+        """Make the call, in a thread, and keep its result."""
         try:
             self.value = self._call()
         except Exception as error:
@@ -48,10 +48,10 @@ class Call(Generic[T]):
 
 
 class Calls(Generic[T]):
-    """Runs calls at the same time, in daemon threads: so many at once, the others after these.
+    """Runs calls in daemon threads, at most ``at_once`` at a time.
     ``each``: the calls, in their order.
-    Raises ``RuntimeError``: the system has no thread left. Then, and after an interrupt, those that
-    have begun go on, and no other begins.
+    Raises ``RuntimeError``: no thread can be started. After that, and after an interrupt, calls
+    that have begun continue, and no other begins.
     """
 
     def __init__(self, calls: Sequence[Callable[[], T]], at_once: int = _AT_ONCE) -> None:
@@ -66,13 +66,13 @@ class Calls(Generic[T]):
             raise
 
     def _run(self) -> None:
-        """In each thread."""
+        """Run calls until none is left, in each thread."""
         with contextlib.suppress(IndexError):  # nothing is left
             while True:
                 self._left.popleft().run()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Until all are done, or so many seconds; whether they are. If interrupted, they go on."""
+        """Wait until all calls are done, or for ``timeout_s``; returns whether all are done."""
         until = None if timeout_s is None else monotonic() + timeout_s
         while not all(call.done for call in self.each):
             left_s = _LOOK_S if until is None else min(_LOOK_S, until - monotonic())
@@ -85,7 +85,7 @@ class Calls(Generic[T]):
         return True
 
     def results(self) -> list[T]:
-        """What all returned. Raises what one raised, without a wait for those that have begun."""
+        """The results of all calls. Raises the first exception without waiting for the others."""
         try:
             return [self._result(call) for call in self.each]
         finally:
