@@ -1,7 +1,7 @@
 """The worker: executes a repository's environments under confinement, and serves them.
 
-Self-contained: the standard library, numpy, gymnasium, msgpack, pyzmq and cloudpickle only, so
-that this one folder can be put in front of any interpreter. Imported as ``envhub_worker``.
+Self-contained: it needs only the standard library, numpy, gymnasium, msgpack, pyzmq and
+cloudpickle, so that any interpreter can load this folder. Imported as ``envhub_worker``.
 """
 
 __version__ = "0.1.0"

@@ -46,7 +46,8 @@ from envhub_worker.server import serve
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command: see the head of this file."""
     replace_missing_streams()  # before anything of ours is opened
-    # jails of root are another user, who must get through to what we make; what is private says so
+    # The jails of a root server run as another user, who must be able to read our files; private
+    # files set their own mode.
     os.umask(0o022)
     argv = sys.argv[1:] if argv is None else argv
     parser, names = _parser(all_commands=argv[:1] != ["serve"])
@@ -57,10 +58,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def replace_missing_streams() -> None:
-    """See to it that the numbers 0, 1 and 2 are taken, and that ``print`` finds a stream.
+    """Open the descriptors 0, 1 and 2 if they are closed, and set ``sys.stdout`` and the like.
 
-    Else files of ours would have them: what a library prints, as libzmq does before it aborts,
-    would go into a socket or a lock, and a zygote would have them as its own streams.
+    Otherwise our own files would get these numbers: a library's output, such as libzmq's before an
+    abort, would go into a socket or a lock, and a zygote would inherit them as its streams.
     """
     while (null := os.open(os.devnull, os.O_RDWR)) < 3:  # the lowest that is free
         os.set_inheritable(null, True)
@@ -71,7 +72,7 @@ def replace_missing_streams() -> None:
 
 
 def _parser(*, all_commands: bool) -> tuple[argparse.ArgumentParser, list[str]]:
-    """The parser, and its commands; ``all_commands``: with those that take long to import."""
+    """Returns the parser and its commands; ``all_commands``: with those that import slowly."""
     parser = argparse.ArgumentParser(
         prog="envhub-worker",
         description="Runs environments from the Hugging Face Hub in confined processes.",
@@ -86,7 +87,7 @@ def _parser(*, all_commands: bool) -> tuple[argparse.ArgumentParser, list[str]]:
 
 
 def _check_command(parser: argparse.ArgumentParser, names: list[str], argv: Sequence[str]) -> None:
-    """Say which command is meant, where one is much like what was typed."""
+    """Suggest a command for a mistyped one."""
     if not argv or argv[0] in names:
         return
     import difflib

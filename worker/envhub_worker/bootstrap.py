@@ -1,8 +1,7 @@
-"""Runs this package in any interpreter, by path: nothing of it stands on ``sys.path``.
+"""Runs this package in any interpreter by its path, without an entry on ``sys.path``.
 
-The interpreter may be one that has never heard of ``envhub_worker`` (a repository's own
-environment), and a repository may bring a ``worker.py`` of its own. So the package is loaded
-from the folder of this very file::
+The interpreter may lack ``envhub_worker`` (in a repository's own environment), and a repository may
+bring a ``worker.py`` of its own. So this file loads the package from its own folder::
 
     python -I .../bootstrap.py worker ARGS...    envhub_worker.__main__.main(ARGS)
     python -s .../bootstrap.py zygote ARGS...    envhub_worker.spawn.zygote.main(ARGS)
@@ -42,20 +41,20 @@ _NEEDED = {
 def command(
     python: str, program: str, *args: str, site: bool = True, options: Sequence[str] = ()
 ) -> list[str]:
-    """The argv that runs ``program`` (a key of ``_PROGRAMS``) with ``args`` in ``python``.
+    """Returns the argv that runs ``program`` (a key of ``_PROGRAMS``) with ``args`` in ``python``.
 
-    Without ``site`` there are no packages but the standard library, and so no start-up files of
-    theirs: no ``.pth``, no ``sitecustomize``. A zygote, whose environment is built, obeys the
-    variables for Python in it.
+    Without ``site`` only the standard library can be imported, and no start-up file of a package
+    runs: no ``.pth``, no ``sitecustomize``. A zygote obeys Python's environment variables, since we
+    build its environment.
     """
     flags = ["-s" if program == "zygote" else "-I", *([] if site else ["-S"])]
     return [python, *flags, os.path.abspath(__file__), *options, program, *args]
 
 
 def _add_user_site(folder: str) -> None:
-    """Packages of ``pip install --user``, before those of all users, as Python has them.
+    """Adds the packages of ``pip install --user``, before those of all users, like Python.
 
-    Python itself adds them by a home, which a server and a zygote do not have.
+    Python itself finds them by ``HOME``, which a server and a zygote do not have.
     """
     import site
 
@@ -89,7 +88,7 @@ def main(argv: Sequence[str]) -> int:
         sys.stderr.write(f"usage: bootstrap.py {{{','.join(_PROGRAMS)}}} ARGS...\n")
         return 2
     load_package()
-    # now: later this process may be another user, who may not read it
+    # Import now: later this process may be another user, who may not read the file.
     hidden = importlib.import_module("envhub_worker.file_access").why_file_hidden
     try:
         program = importlib.import_module(_PROGRAMS[argv[0]])

@@ -1,11 +1,11 @@
 """Makes the bytecode of a folder of packages: ``bootstrap.py bytecode FOLDER NUMBER COUNT``, by one
 of several processes that share it.
 
-A compiler runs nothing of what it reads, but what it reads is a stranger's, and compilers have
-faults. So this process is confined before it opens any of it: it may read the standard library and
-the folder, and write into the folder, and that is all: no capabilities, no network, no other file,
-no system call that a jail has not. What a fault would give somebody is the folder, which is theirs
-anyway. Where this host has not all of these layers, nothing is compiled: jails then start slower.
+A compiler does not run its input, but the input is a stranger's, and compilers have bugs. So this
+process is confined before it opens a file of the folder. It may read the standard library and the
+folder and write into the folder, and nothing else: it has no capabilities, no network, no other
+files, and only a jail's system calls. A bug could then give an attacker the folder only, which is
+his anyway. If this host lacks one of these layers, nothing is compiled, and jails start slower.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def confine_to_bytecode_folder(folder: str) -> None:
     program = filter.compile_filter(namespaced=False, network="none", scoped=landlock.scopes(abi))
     process.drop_capabilities()
     process.set_no_new_privileges()
-    # without an ABI it raises: no layer is left out
+    # Raises if the kernel has no Landlock: no layer may be missing.
     landlock.restrict(
         landlock.ruleset(abi, "none"), [LandlockRule(library, READ), LandlockRule(folder, WRITE)]
     )
@@ -48,16 +48,16 @@ def confine_to_bytecode_folder(folder: str) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Compile a share of the folders below one, but for tests, which are not imported."""
+    """Compile this process's share of the folders, without tests, which nobody imports."""
     folder, number, count = argv[0], int(argv[1]), int(argv[2])
     try:
         confine_to_bytecode_folder(folder)
     except LayerUnavailableError:
         return 1
     left_out = re.compile(re.escape(folder) + r"(/.*)?/tests?/", re.DOTALL)
-    # never held against its source again: both are read-only by then
+    # Never compared with its source again: both will be read-only.
     mode = py_compile.PycInvalidationMode.UNCHECKED_HASH
-    # but those that the others make meanwhile: each has the same list
+    # Other processes make __pycache__ folders meanwhile: without them all lists are the same.
     below = sorted(top for top, _, _ in os.walk(folder) if not top.endswith("/__pycache__"))
     for place in below[number::count]:
         compileall.compile_dir(

@@ -1,6 +1,6 @@
-"""Why a file could not be read or written: closed to this process, or not there at all.
+"""Explains why a file could not be read or written: this process lacks the right, or it is missing.
 
-The import system calls both missing; and what a jail shares with others it only reads.
+The import system reports both as missing; and a jail may only read files that it shares.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _REFUSALS = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
 def why_file_hidden(module: str) -> str:
-    """Why a module that was not found may be there all the same; empty if nothing hides it.
+    """Explains why an existing module may not be found; empty if no permission hides it.
     ``module``: its dotted name, as in ``ModuleNotFoundError.name``.
     """
     parent, _, last = module.rpartition(".")
@@ -34,7 +34,9 @@ def why_file_hidden(module: str) -> str:
 
 
 def _closed(path: str) -> str:
-    """What keeps this process from reading a path, with its owner and mode; empty for nothing."""
+    """Describes the file or folder, with owner and mode, that keeps this process from reading a
+    path; empty if none does.
+    """
     try:
         status = os.stat(path)
     except PermissionError:
@@ -53,7 +55,7 @@ def _closed(path: str) -> str:
 
 
 def why_file_unwritable(error: BaseException, root: str) -> str:
-    """A sentence for an error whose file lies among what a jail shares; empty for any other."""
+    """Explains an error about a file that a jail shares; empty for other errors."""
     name = getattr(error, "filename", None)
     if not isinstance(error, OSError) or error.errno not in _REFUSALS:
         return ""
@@ -84,7 +86,7 @@ def why_file_unwritable(error: BaseException, root: str) -> str:
 
 
 def why_no_terminal(error: BaseException) -> str:
-    """A sentence for an error about a pseudo terminal, which names none; empty for any other."""
+    """Explains an error about a pseudo terminal, which does not name it; empty for other errors."""
     name = str(getattr(error, "filename", ""))
     asked = name.startswith(("/dev/ptmx", "/dev/tty")) or "pty devices" in str(error)
     if not isinstance(error, OSError) or not asked:
@@ -102,7 +104,7 @@ def _place(path: str, root: str) -> str:
 
 
 def _distribution(path: str) -> str:
-    """The distribution that has brought the package of a file, or the name of the package."""
+    """Returns the distribution that installed the package of a file, or the package's name."""
     folder = max((one for one in sys.path if one and _within(path, one)), key=len)
     package = os.path.relpath(path, folder).split(os.sep)[0]
     return metadata.packages_distributions().get(package, [package])[0]
@@ -113,7 +115,7 @@ def _within(path: str, folder: str) -> bool:
 
 
 def _is_read_only(path: str) -> bool:
-    """Whether nothing in the file's folder can be made or removed."""
+    """Whether no file can be made or removed in the file's folder."""
     folder = os.path.dirname(path)
     read_only = os.statvfs(folder).f_flag & os.ST_RDONLY
     return bool(read_only) or not os.access(folder, os.W_OK | os.X_OK)

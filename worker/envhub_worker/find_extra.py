@@ -1,4 +1,4 @@
-"""Extras by their names: the core imports none, and does without one that is not there."""
+"""Finds extras by name: the core imports no extra directly and works without a missing one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _HERE = os.path.join(os.path.dirname(os.path.abspath(__file__)), "extras", "__in
 
 
 def find_extra(name: str) -> ModuleType | None:
-    """A module of ``extras``, by its name below it; None if this copy lacks it."""
+    """Returns a module of ``extras`` by its name; None if this copy of the package lacks it."""
     if not os.path.exists(_HERE):  # the interpreter may have another copy, of another version
         return None
     module = f"{__package__}.extras.{name}"

@@ -1,6 +1,6 @@
-"""One thread, one poll: callbacks for descriptors; and whole ZeroMQ messages, sent and received.
+"""A poll loop in one thread with callbacks for descriptors; sends and receives ZeroMQ messages.
 
-The functions for messages do without what pyzmq's own do for each frame.
+The functions for messages skip work that pyzmq's own do for each frame.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import zmq
 
 from envhub_worker.protocol.codec.wire import Buffer
 
-# plain numbers: as members of an enumeration they cost more than the calls that take them
+# Plain numbers: reading an enumeration's member costs more than the call that takes it.
 _MORE = int(zmq.SNDMORE)
 _NOW = int(zmq.NOBLOCK)
 _EVENTS = int(zmq.EVENTS)
@@ -29,7 +29,7 @@ _MAX_FAILURES = 100
 
 class Loop:
     """Calls back when a descriptor or a ZeroMQ socket is ready, until ``stop``.
-    ``failed``: called with what a callback raised; it must not raise.
+    ``failed``: called with the error of a callback; it must not raise.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
@@ -42,20 +42,20 @@ class Loop:
         self._failures = 0
 
     def tick(self, callback: Callable[[], None]) -> None:
-        """Call back about once a second, from now on."""
+        """Call a function about once a second, from now on."""
         self._tick = callback
 
     def look_by(self, callback: Callable[[], int | None]) -> None:
-        """Call back before each wait; it says how many milliseconds that may last, or None."""
+        """Call a function before each wait; it returns the wait's milliseconds at most, or None."""
         self._look = callback
 
     def watch(self, source: Any, callback: Callable[[], None]) -> None:
-        """Call back when there is something to read."""
+        """Call a function when a source is readable."""
         self._poller.register(source, zmq.POLLIN)
         self._callbacks[source] = callback
 
     def watch_writes(self, source: Any, wanted: bool) -> None:
-        """Whether to call a watched source back also when it can be written to."""
+        """Set whether a watched source's function is also called when the source is writable."""
         self._poller.register(source, zmq.POLLIN | (zmq.POLLOUT if wanted else 0))
 
     def unwatch(self, source: Any) -> None:
@@ -64,7 +64,7 @@ class Loop:
             self._poller.unregister(source)
 
     def call_on(self, signals: Mapping[int, Callable[[], None]]) -> None:
-        """Call back at these signals, between two rounds; to be called on the main thread."""
+        """Call a function at these signals, between two rounds. Only on the main thread."""
         woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         signal.set_wakeup_fd(wakes)  # it gets the signals' numbers, a byte each
         for number in signals:
@@ -82,7 +82,7 @@ class Loop:
         self._stopped = True
 
     def run(self) -> None:
-        """Call back until ``stop``."""
+        """Poll and call functions until ``stop``."""
         ticked = monotonic()
         while not self._stopped:
             for ready, _ in self._poller.poll(self._wait_ms()):
@@ -102,7 +102,9 @@ class Loop:
         return _POLL_MS if wait_ms is None else wait_ms
 
     def _call(self, callback: Callable[[], None]) -> None:
-        """One client's misfortune is not everybody's; what fails again and again is the end."""
+        """Call a function. A single error must not end the server for all clients; after many
+        failures in a row the error is raised.
+        """
         try:
             callback()
         except Exception as error:
@@ -115,12 +117,12 @@ class Loop:
 
 
 def has_message(socket: zmq.Socket[bytes]) -> bool:
-    """Whether ``receive`` would return one: without the exception that ends a vain attempt."""
+    """Whether ``receive`` would return a message; cheaper than the exception of a vain attempt."""
     return bool(int(socket.getsockopt(_EVENTS)) & _READABLE)
 
 
 def receive(socket: zmq.Socket[bytes]) -> list[bytes]:
-    """The frames of a message that is there; raises ``zmq.Again`` if none is."""
+    """Returns the frames of an arrived message; raises ``zmq.Again`` if there is none."""
     frame = socket.recv(_NOW, copy=False)
     frames = [frame.bytes]
     while frame.more:
@@ -130,9 +132,9 @@ def receive(socket: zmq.Socket[bytes]) -> list[bytes]:
 
 
 def send(socket: zmq.Socket[bytes], frames: Sequence[Buffer], *, copy: bool) -> None:
-    """Send without waiting; what a client's queue has no room for is dropped.
+    """Send without waiting; drops the message if the client's queue is full.
 
-    Without ``copy``, large frames may not be written any more.
+    Without ``copy``, the caller must not change large frames any more.
     """
     for frame in frames[:-1]:
         socket.send(frame, _NOW | _MORE, copy)

@@ -1,9 +1,8 @@
-"""What a server's clients may do: everything, or what a stranger's quotas permit.
+"""Decides what a server's clients may do: everything, or only what their quotas permit.
 
-One ``Server`` serves both. A ``LocalGate`` stands before a socket in a private folder, whose
-clients are the user who started the server. A ``RemoteGate`` (``remote_gate.py``) stands before a
-TCP port: its clients have proved a key, and still may neither name a path of this machine nor take
-it all.
+One ``Server`` class serves both. A ``LocalGate`` guards a socket in a private folder, whose clients
+are the user who started the server. A ``RemoteGate`` (``remote_gate.py``) guards a TCP port: its
+clients have proved a key, but may not name paths of this machine or use up its resources.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ from envhub_worker.supervisor.records import Asker, Witness
 
 
 class Incoming(NamedTuple):
-    """A message as it came.
+    """A received message.
 
     Attributes:
-        key: The key that its sender has proved; empty where none is needed.
-        fd: The descriptor of the connection that it came over; -1 if that is not known.
+        key: The key that its sender has proved; empty if the server needs no keys.
+        fd: The descriptor of its connection; -1 if that is not known.
     """
 
     identity: bytes
@@ -40,13 +39,13 @@ Handler = Callable[[Asker, Any, Payload], m.Message]
 
 
 class Gate:
-    """Decides what a client may do. A subclass must say what is permitted.
+    """Decides what a client may do. Subclasses define what is permitted.
 
     Attributes:
-        handlers: The requests that only this gate knows.
+        handlers: Handlers of requests that only this gate knows.
         compresses: Whether frames are worth compressing.
-        idle_s: How long the jails of a client that says nothing live on; 0 for ever.
-        sessions, jails: The server's, since ``begin``.
+        idle_s: How long the jails of a silent client live; 0 for ever.
+        sessions, jails: Those of the server, set by ``begin``.
     """
 
     sessions: Sessions
@@ -57,7 +56,7 @@ class Gate:
     witness = Witness()
 
     def begin(self, sessions: Sessions, jails: Jails) -> None:
-        """The server exists now."""
+        """Take the server's sessions and jails, once the server exists."""
         self.sessions, self.jails = sessions, jails
 
     def receive(self, router: zmq.Socket[bytes]) -> Incoming:
@@ -65,46 +64,46 @@ class Gate:
         raise NotImplementedError
 
     def greet(self, arrived: Incoming, name: bytes) -> None:
-        """A session of this name begins, or is found again; raises ``RefusedError``."""
+        """Permit a session to begin or to reconnect, or raise ``RefusedError``."""
         raise NotImplementedError
 
     def authorize(self, asker: Asker, request: m.Message, payload: Payload) -> m.Message:
-        """The request as it may be carried out, never a reply; raises ``RefusedError``."""
+        """Return the request to carry out, possibly changed, or raise ``RefusedError``."""
         raise NotImplementedError
 
     def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
-        """Set what must be set before the socket is bound."""
+        """Configure the socket before it is bound."""
 
     def answered(self, asker: Asker, reply: m.Message) -> None:
-        """A request has this answer."""
+        """Take note of a request's answer."""
 
     def tick(self) -> None:
-        """A second has passed."""
+        """Do periodic work; called about once a second."""
 
     def drain(self) -> bool:
-        """Let nothing new in from now on; False if nothing that runs is waited for."""
+        """Refuse new work from now on; False if this gate does not wait for running work."""
         return False
 
     def drained(self) -> bool:
-        """Whether ``drain`` was called, and nothing runs any more."""
+        """Whether ``drain`` was called and no work runs any more."""
         return False
 
     def close(self) -> None:
-        """End all sessions; close what ``secure`` opened."""
+        """End all sessions and undo ``secure``."""
 
 
 class LocalGate(Gate):
-    """The folder of the socket, of mode 0700, is the gate: who can reach it is the user."""
+    """Permits everything: only the user can reach the socket, in a folder of mode 0700."""
 
     def receive(self, router: zmq.Socket[bytes]) -> Incoming:
-        """No client has a key."""
+        """Receive the next message, which has no key."""
         identity, *frames = receive(router)
         return Incoming(identity, b"", frames)
 
     def greet(self, arrived: Incoming, name: bytes) -> None:
-        """Every client is welcome."""
+        """Permit every session."""
         self.sessions.connect(arrived.identity, arrived.key, name)
 
     def authorize(self, asker: Asker, request: m.Message, payload: Payload) -> m.Message:
-        """Everything is permitted."""
+        """Return the request unchanged."""
         return request

@@ -1,7 +1,7 @@
 """``envhub-worker serve``: a worker server for the one client that started it.
 
-The head of ``__main__.py`` has its contract. What is heavy is imported late: the zygote is started
-before, and both import at once.
+The docstring of ``__main__.py`` has its contract. Heavy modules are imported after the zygote has
+been started, so that both processes import at the same time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``serve``."""
+    """Add the options of ``serve``."""
     parser.add_argument("--endpoint", required=True)
     parser.add_argument("--runtime-dir", type=Path, required=True)
     parser.add_argument("--readable-root", action="append", default=[])

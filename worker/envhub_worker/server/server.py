@@ -1,7 +1,7 @@
 """The worker server: ZeroMQ towards clients on one side, jails on the other.
 
-Trusted code in one thread and one poll loop. Who the clients are, and what they may, is the
-business of its gate.
+Trusted code in one thread and one poll loop. Its gate knows who the clients are and what they may
+do.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class Server:
         self._gate: Gate = gate or LocalGate()
         self._sessions = Sessions()
         self._loop = Loop(self._gate.witness.failed)
-        # ROUTER's own routing ids come from rand(), which libzmq does not seed: who can tell the
-        # next one can claim it, and that ends the process
+        # ROUTER takes its routing ids from rand(), which libzmq does not seed. A client that
+        # predicts the next id can claim it, and libzmq then aborts the process.
         ctypes.CDLL(None).srand(int.from_bytes(os.urandom(4), "little"))
         self._context = zmq.Context()
         self._router = self._listen(endpoint)
@@ -81,7 +81,7 @@ class Server:
 
     @property
     def endpoint(self) -> str:
-        """Where it listens, with the port that was found for it."""
+        """The endpoint that the server listens on, with its real port."""
         return str(self._router.get_string(zmq.LAST_ENDPOINT))
 
     def _tick(self) -> None:
@@ -93,8 +93,8 @@ class Server:
     def stop_on(self, *signals: int, gently: Sequence[int] = ()) -> None:
         """End the loop at these signals; to be called on the main thread.
 
-        At those of ``gently`` nothing new is taken, and a second one ends it; the first does, where
-        the gate does not wait for what runs.
+        A signal of ``gently`` makes the gate refuse new work, and a second one ends the loop. If
+        the gate does not wait for running work, the first one ends it.
         """
         self._loop.call_on(
             {**dict.fromkeys(signals, self.stop), **dict.fromkeys(gently, self._drain)}
@@ -120,7 +120,7 @@ class Server:
         return router
 
     def run(self) -> None:
-        """Serve; on the way out every jail and zygote is gone."""
+        """Serve until the loop ends; then end every jail and zygote."""
         try:
             self._loop.run()
         finally:
@@ -167,7 +167,7 @@ class Server:
             self.reply(asker, RefusedError("WorkerError", text).reply)
 
     def _refuse_unread(self, identity: bytes, key: bytes, frame: Any, error: Exception) -> None:
-        """Answer a request that cannot be read, if at least its id can be."""
+        """Answer an unreadable request, if its id is readable."""
         number = m.id_of(frame)
         if number is None:
             return  # not our protocol
@@ -176,7 +176,7 @@ class Server:
         self.reply(Asker(identity, number, b"", key), refused.reply)
 
     def _dispatch(self, asker: Asker, request: m.Message, arrived: Incoming) -> m.Message | None:
-        """The reply; None if it was sent, or comes later. Raises ``AnsweredError``."""
+        """Returns the reply; None if it was sent or comes later. Raises ``AnsweredError``."""
         if isinstance(request, m.Hello):
             return self._hello(request, arrived)
         payload = arrived.frames[1:]
@@ -223,7 +223,8 @@ class Server:
         return m.Welcome(m.VERSION, __version__, os.getpid())
 
     def _agree(self, asker: Asker, request: m.Agree) -> None:
-        """Answer first: the reply itself is not compressed yet."""
+        """Agree on a compression for later messages."""
+        # In this order: the reply goes out first, for it is not compressed yet.
         possible = compression.available() if self._gate.compresses else ()
         chosen = next((name for name in request.compressions if name in possible), "")
         self.reply(asker, m.Agreement(str(chosen), self._gate.idle_s))

@@ -1,4 +1,4 @@
-"""Who is connected: sessions of clients, and the connections that each of them has."""
+"""The sessions of connected clients, and each session's connections."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MAX_HELD = 8192
 @dataclass
 class Connection:
     """A connection of a session.
-    ``wire``: its number among the open connections, or None if these are not counted.
+    ``wire``: the number of the open connection, or None if the gate does not count them.
     """
 
     wire: int | None = None
@@ -29,14 +29,14 @@ class Connection:
 
 @dataclass
 class Session:
-    """One client: a process of somebody who holds a key.
+    """One client: a process of a key's owner.
 
     Attributes:
-        key: The client's public key, as ZAP gave it; empty where there is none.
+        key: The client's public key, as ZAP reported it; empty without keys.
         name: The client's own random bytes.
-        heard: When it last said anything.
-        held: The jails that it holds, and when it last said so or used them; None before it said
-            so for the first time.
+        heard: When its last message came.
+        held: The jails that it holds, each with the time of its last ``KeepAlive`` or use; None
+            before the first ``KeepAlive``.
     """
 
     key: bytes
@@ -48,15 +48,15 @@ class Session:
 
     @property
     def owner(self) -> bytes:
-        """What its jails are marked with: no client with another key can have it."""
+        """The mark of the session's jails, which no client with another key can have."""
         return self.key + self.name
 
 
 class Sessions:
-    """Every session, and which connection belongs to which.
+    """All sessions, and the session of each connection.
 
-    A connection is known by its routing id **and** its key: a routing id is whatever the peer
-    claims, a key was proved.
+    A connection is identified by its routing id **and** its key: a peer may claim any routing id,
+    but it has proved its key.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -65,15 +65,15 @@ class Sessions:
         self._of: dict[tuple[bytes, bytes], Session] = {}
 
     def all(self) -> list[Session]:
-        """Every session."""
+        """Returns every session."""
         return list(self._sessions.values())
 
     def of_key(self, key: bytes) -> list[Session]:
-        """Every session of a key."""
+        """Returns every session of a key."""
         return [session for session in self._sessions.values() if session.key == key]
 
     def connect(self, identity: bytes, key: bytes, name: bytes, wire: int | None = None) -> Session:
-        """Add a connection to the session of this name, which is created if there is none."""
+        """Add a connection to the session of this name; makes a new session if there is none."""
         session = self._sessions.get(key + name)
         if session is None:
             session = self._sessions[key + name] = Session(key, name, self._clock())
@@ -97,7 +97,7 @@ class Sessions:
                     self._disconnect(name)
 
     def find(self, identity: bytes, key: bytes) -> Session | None:
-        """The session of a connection that has said something just now."""
+        """Returns the session of a connection whose message has just come."""
         session = self._of.get((identity, key))
         if session is not None:
             session.heard = self._clock()
@@ -105,16 +105,16 @@ class Sessions:
         return session
 
     def agree(self, identity: bytes, key: bytes, compression: str) -> None:
-        """From here on a connection's frames may be compressed."""
+        """Allow compression of a connection's frames from now on."""
         self._of[identity, key].connections[identity, key].compression = compression
 
     def compression(self, identity: bytes, key: bytes) -> str:
-        """What a connection has agreed to; empty for none."""
+        """Returns a connection's compression; empty for none."""
         session = self._of.get((identity, key))
         return "" if session is None else session.connections[identity, key].compression
 
     def idle(self, idle_s: float) -> list[Session]:
-        """Sessions that were silent for so long."""
+        """Returns the sessions that were silent for ``idle_s``."""
         now = self._clock()
         return [session for session in self._sessions.values() if now - session.heard > idle_s]
 
@@ -125,14 +125,14 @@ class Sessions:
         self._sessions.pop(session.owner, None)
 
     def keep(self, session: Session, jails: tuple[int, ...]) -> None:
-        """Write down which jails the client holds."""
+        """Record which jails the client holds."""
         now = self._clock()
         listed = dict.fromkeys(jails, now)
         before = [item for item in (session.held or {}).items() if item[0] not in listed]
         session.held = dict([*before, *listed.items()][-MAX_HELD:])
 
     def used(self, identity: bytes, key: bytes, jail: int) -> None:
-        """A connection uses a jail: so its client holds it, even if it no longer says so."""
+        """Record that a connection uses a jail: its client holds it, even without ``KeepAlive``."""
         session = self._of.get((identity, key))
         if session is not None and session.held is not None and jail in session.held:
             session.held[jail] = self._clock()

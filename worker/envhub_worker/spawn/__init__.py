@@ -1,1 +1,1 @@
-"""From a zygote to a jail: fork, hand over, start."""
+"""Starts jails: a zygote forks an init, and init forks confined runners."""

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 
 from envhub_worker.lockdown.mechanisms.environment import THREAD_TIMEOUT
 
-# numpy's wheels carry a build whose symbols have a prefix and a suffix.
+# numpy's wheels bring an OpenBLAS whose symbols have a prefix and a suffix.
 _SETTERS = (
     "scipy_openblas_set_num_threads64_",
     "openblas_set_num_threads64_",
@@ -22,12 +22,12 @@ _SETTERS = (
     "openblas_set_num_threads",
 )
 _VARIABLES = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")
-# Each thread is one of the jail's processes.
+# Each thread counts as one of the jail's processes.
 _MOST = 16
 
 
 def find_setter() -> Callable[[int], None] | None:
-    """The loaded OpenBLAS's function that sets its threads; None where numpy has another BLAS."""
+    """Returns OpenBLAS's function that sets its threads; None if numpy has another BLAS."""
     with open("/proc/self/maps") as maps:
         paths = {line.split(maxsplit=5)[5].strip() for line in maps if "openblas" in line}
     for path in sorted(paths):
@@ -44,7 +44,7 @@ def find_setter() -> Callable[[int], None] | None:
 
 
 def _thread_count(runners: int) -> int:
-    """The number in OpenBLAS's variables; else an equal share of the cores for each runner."""
+    """Returns the number in OpenBLAS's variables; else an equal share of the cores per runner."""
     for name in _VARIABLES:
         value = os.environ.get(name, "")
         if value.isdigit() and int(value) > 0:
@@ -54,7 +54,7 @@ def _thread_count(runners: int) -> int:
 
 @contextmanager
 def threads_at_load(runners: int) -> Iterator[None]:
-    """Set OpenBLAS's variables while a runner itself loads it, and remove them afterwards."""
+    """Set OpenBLAS's variables while a runner itself loads it, then remove them."""
     count = str(_thread_count(runners))
     variables = {"OPENBLAS_NUM_THREADS": count, "OPENBLAS_THREAD_TIMEOUT": THREAD_TIMEOUT}
     fresh = {name: value for name, value in variables.items() if name not in os.environ}

@@ -41,7 +41,7 @@ class Channel:
         return self._socket.fileno()
 
     def send(self, message: Message, fds: Sequence[int] = ()) -> None:
-        """Send, or keep for ``flush`` when the socket is full. ``fds`` stay the caller's.
+        """Send, or keep the message for ``flush`` if the socket is full. ``fds`` stay the caller's.
         Raises ``ValueError``: the message is larger than ``MAX_MESSAGE_BYTES``.
         """
         data = json.dumps(message).encode()
@@ -59,7 +59,7 @@ class Channel:
             os.close(pidfd)
 
     def flush(self) -> None:
-        """Send what is waiting, as far as the socket takes it. A peer that is gone is no error.
+        """Send waiting messages as far as the socket takes them. A peer that has ended is no error.
         Raises ``OSError``: a message cannot be sent, and is dropped.
         """
         while self._unsent:
@@ -79,8 +79,8 @@ class Channel:
         close_fds(self._unsent.popleft()[1])
 
     def receive(self) -> tuple[Message, list[int]] | None:
-        """The next message and its descriptors, or None at the end of the stream.
-        Raises ``BlockingIOError``: nothing is there (non-blocking sockets).
+        """Returns the next message and its descriptors, or None at the end of the stream.
+        Raises ``BlockingIOError``: no message has arrived (non-blocking sockets).
         """
         try:
             data, fds, flags = self._receive()
@@ -105,7 +105,7 @@ class Channel:
         return data, list(fds), flags
 
     def drain(self) -> tuple[list[tuple[Message, list[int]]], bool]:
-        """Everything that is there now, and whether the stream has ended."""
+        """Returns all messages that have arrived, and whether the stream has ended."""
         messages: list[tuple[Message, list[int]]] = []
         with contextlib.suppress(BlockingIOError):
             while True:
@@ -116,7 +116,7 @@ class Channel:
         return messages, False
 
     def close(self) -> None:
-        """Close the socket and whatever was not sent. Idempotent."""
+        """Close the socket and drop unsent messages. Idempotent."""
         while self._unsent:
             self._drop_first()
         self._socket.close()

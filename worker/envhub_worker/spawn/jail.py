@@ -1,4 +1,4 @@
-"""The server's handle on one jail, and the events that it gives."""
+"""The server's handle on one jail, and the jail's events."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from envhub_worker.spawn.channel import Channel, close_fds
 
 @dataclass(frozen=True)
 class JailFailed:
-    """A layer that the profile names cannot be had here; the jail ends, nothing has run."""
+    """This host lacks a layer that the profile requires; the jail ends before any code ran."""
 
     layer: str
     reason: str
@@ -33,8 +33,8 @@ class RunnerStarted:
     """A runner is confined, has tested its denials, and now enters ``runner.main``.
 
     Attributes:
-        pid: Its pid as this process sees it; 0 or less when it has already ended.
-        report: Every layer that holds for it, the jail's own first.
+        pid: The runner's pid as this process sees it; 0 or less after its end.
+        report: Every enforced layer, the jail's own first.
     """
 
     runner: int
@@ -45,7 +45,7 @@ class RunnerStarted:
 @dataclass(frozen=True)
 class RunnerExited:
     """A runner has ended, with an exit code or by a signal.
-    ``detail``: the numbers, where a limit was the reason.
+    ``detail``: the numbers, if a limit was the reason.
     """
 
     runner: int
@@ -57,11 +57,11 @@ class RunnerExited:
 
 @dataclass(frozen=True)
 class CallDenied:
-    """Something in the jail tried a system call that the policy denies, for the first time.
+    """A process of the jail tried a denied system call for the first time.
 
     Attributes:
-        call: Its name; of what is asked of a file also "read" or "write".
-        detail: What is known of its arguments: a family of sockets, a path, or nothing.
+        call: The name of the call; for files also "read" or "write".
+        detail: The reported argument: a socket family, a path, or nothing.
     """
 
     call: str
@@ -85,7 +85,7 @@ class Jail:
     Attributes:
         output: Read end of the pipe that holds the jail's stdout and stderr; non-blocking.
         theirs: The other ends, for init; ``Spawner`` closes them.
-        pidfd: Of the jail's init; -1 before it is known and after it has gone.
+        pidfd: A pidfd of the jail's init; -1 before its start and after its end.
     """
 
     def __init__(self, spec: JailSpec, folder: Path | None, owner: int | None) -> None:
@@ -117,45 +117,45 @@ class Jail:
         close_fds(fds)
 
     def give_up(self) -> None:
-        """Undo the creation of a jail that no zygote was asked for."""
+        """Undo the creation of a jail before any zygote has been asked to fork it."""
         os.close(self.output)
         close_fds(self.theirs)
         self._channel.close()
         self.release()
 
     def attach(self, pidfd: int) -> None:
-        """The zygote has forked the jail's init."""
+        """Take note that the zygote has forked the jail's init."""
         self.pidfd = pidfd
         if self._killed:
             self._signal_init()
 
     @property
     def pid(self) -> int:
-        """The number of the jail's init, as seen from here; below 1 before and after its life."""
+        """The pid of the jail's init as this process sees it; below 1 before and after its life."""
         try:
             return process.pid_of(self.pidfd)
         except OSError:
             return -1
 
     def runner_pids(self) -> list[int]:
-        """The numbers of its runners that live, as seen from here."""
+        """The pids of the live runners as this process sees them."""
         pids = map(process.pid_of, self._runner_pidfds.values())
         return [pid for pid in pids if pid > 0]
 
     def refused_processes(self) -> bool:
-        """Whether its control group, if it has one, has refused it any."""
+        """Whether the jail's control group, if any, has refused it a process."""
         return self._group is not None and self._group.refused()
 
     def runner_pidfd(self, runner: int) -> int:
-        """A pidfd of a runner, or -1 before it has started and after it has gone."""
+        """Returns a pidfd of a runner, or -1 before its start and after its end."""
         return self._runner_pidfds.get(runner, -1)
 
     def fileno(self) -> int:
-        """Readable when ``poll`` has something to say; -1 once the jail has gone."""
+        """A descriptor that is readable when ``poll`` has events; -1 after the jail's end."""
         return self._channel.fileno()
 
     def poll(self) -> list[JailEvent]:
-        """What has happened in the jail since the last call."""
+        """Returns the jail's events since the last call."""
         if self._channel.fileno() < 0:
             return []
         self._channel.flush()
@@ -199,7 +199,7 @@ class Jail:
         return self._count, ours
 
     def kill_runner(self, runner: int) -> None:
-        """End a runner and what it started. ``RunnerExited`` follows."""
+        """End a runner and the processes that it started. ``RunnerExited`` follows."""
         if self._channel.fileno() >= 0:
             self._channel.send({"op": "kill", "runner": runner})
 
@@ -211,14 +211,14 @@ class Jail:
 
     def _signal_init(self) -> None:
         if self.pidfd >= 0:
-            # Without a pid namespace, init must itself end what it started.
+            # Without a pid namespace init must end the jail's processes itself: do not kill it.
             signum = signal.SIGTERM if self._folder else signal.SIGKILL
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self.pidfd, signum)
 
     def release(self) -> None:
-        """Everything in the jail is dead: give back its files and the handle on its init. What it
-        said and printed stays the caller's to read.
+        """Release the files and the init's pidfd of a jail whose processes have all ended. Its
+        events and its output stay readable.
         """
         if self.pidfd >= 0:
             os.close(self.pidfd)

@@ -1,8 +1,8 @@
 """The first process of a jail: it sets the jail up, starts runners in it, and ends them all.
 
-Trusted code. It reads its jail's specification from its control channel, which is the first
-message, ``{"spec": S, "scratch": folder | null, "cgroup": kind | null}`` with the descriptors of
-``cgroups.Group.open``; then requests::
+Trusted code. The first message on its control channel is the jail's specification,
+``{"spec": S, "scratch": folder | null, "cgroup": kind | null}`` with the descriptors of
+``cgroups.Group.open``; requests follow::
 
     {"op": "start", "runner": N} + [the runner's stream, further descriptors...]
     {"op": "kill", "runner": N}
@@ -47,7 +47,7 @@ from envhub_worker.protocol.confinement import Reason
 from envhub_worker.spawn import runner_entry
 from envhub_worker.spawn.channel import Channel, close_fds
 
-# before anything is confined
+# Loaded before this process is confined, when it can still read its own files.
 evidence = find_extra("denials")
 
 
@@ -79,11 +79,11 @@ def run(control: int, output: int, common: Common) -> NoReturn:
 
 @dataclass
 class _Runner:
-    """A runner as its init knows it.
+    """An init's record of a runner.
 
     Attributes:
-        status: Where it reports, until it is confined.
-        ended: (reason, detail) of the end that we gave it.
+        status: The channel for the runner's report; None once the runner is confined.
+        ended: (reason, detail) if init has ended the runner.
     """
 
     number: int
@@ -176,7 +176,7 @@ class Init:
 
     def _look(self) -> None:
         if self._watchdog.seconds_left() == 0:
-            # A runner that is still locking itself down runs our code, and cannot be measured yet.
+            # A runner that has not reported yet runs only our code, and cannot be measured.
             starting = [pid for pid, runner in self._runners.items() if runner.status is not None]
             over = self._watchdog.look(procfs.descendants(os.getpid(), starting))
             if over is not None:
@@ -210,7 +210,8 @@ class Init:
         for pid, runner in self._runners.items():
             if runner.number == number:
                 runner.ended = runner.ended or ("killed", "")
-                # Not reaped yet, so the pid is still its own. Stopped, it cannot fork away.
+                # In this order. The runner is not reaped, so the pid is still its own. It is
+                # stopped first, so that it cannot fork while its descendants are killed.
                 os.kill(pid, signal.SIGSTOP)
                 reap.kill_descendants(root=pid)
                 os.kill(pid, signal.SIGKILL)
@@ -222,8 +223,8 @@ class Init:
             os.close(listener)
 
     def _note(self, request: notify.Request) -> None:
-        """Report an attempt, each kind once, but not those of a runner's self-test."""
-        # it may have reported a moment ago, and be a stranger's since
+        """Report a denied attempt, each kind once; ignores attempts of a runner's self-test."""
+        # The runner may have reported a moment ago and run a stranger's code since.
         self._read_report(request.caller)
         runner = self._runners.get(request.caller)
         if runner is not None and runner.status is not None:
@@ -249,7 +250,7 @@ class Init:
             self._channel.send({"event": "denied", "call": call, "detail": detail})
 
     def _read_report(self, pid: int) -> None:
-        """Take a runner's report about its confinement; nothing if ``pid`` is confined."""
+        """Read a runner's report of its confinement, if ``pid`` still owes one."""
         runner = self._runners.get(pid)
         if runner is None or runner.status is None:
             return
@@ -263,7 +264,7 @@ class Init:
                 self._poller.register(fds[0], select.POLLIN)
             else:
                 fields = {"runner": runner.number, "report": message["report"]}
-                # not reaped yet: even if it has ended, the pid is this one's
+                # The runner is not reaped: even if it has ended, the pid is still its own.
                 self._channel.send_pidfd({"event": "runner_started", **fields}, pid)
         if ended:  # or it died before it was confined: its exit says so
             self._poller.unregister(status)
@@ -281,7 +282,7 @@ class Init:
             reap.kill_descendants()  # daemons do not outlive the last runner
 
     def _end_orphans(self, session: int) -> None:
-        """End what a runner leaves behind, while others go on. Daemons end with the last runner."""
+        """End the orphans of a runner while others go on. Daemons end with the last runner."""
         for pid in procfs.descendants(os.getpid(), keep=self._runners):
             with contextlib.suppress(ProcessLookupError):
                 if os.getsid(pid) == session:

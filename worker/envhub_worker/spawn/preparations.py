@@ -1,19 +1,19 @@
-"""What a repository finds in its jail: a cache of the Hub, a display, LeRobot's names.
+"""Prepares a repository's surroundings in its jail: a Hub cache, a display, a stub of LeRobot.
 
 The cache has huggingface_hub's layout: for each repository a folder with ``refs/main``, which names
 the commit, and ``snapshots/COMMIT``, which is a link to the files. ``HF_HUB_OFFLINE`` (see
 ``lockdown.mechanisms.environment``) makes ``snapshot_download`` and ``hf_hub_download`` look there
 and nowhere else.
 
-The display is Xvfb, as confined as what draws on it. It listens on a socket file in the jail's own
-``/tmp`` and nowhere else: neither TCP nor an abstract socket, so that no other jail and no program
-of the host finds it, and no display of the host is there in the jail.
+The display is Xvfb, as confined as the programs that draw on it. It listens only on a socket file
+in the jail's own ``/tmp``, neither on TCP nor on an abstract socket, so no other jail and no
+program of the host reaches it. The host's displays do not exist in the jail.
 
-LeRobot is stood in for where a repository imports it for names alone. An ``env.py`` often imports
-``EnvConfig`` for an annotation, or constants that name observations; a caller's configuration is of
-a class of LeRobot's. LeRobot itself is gigabytes, and takes seconds to import. So a stub has the
-names of LeRobot's contract with environments; what else is asked of it comes from LeRobot itself,
-if that is installed.
+A stub replaces LeRobot if a repository needs only its names. An ``env.py`` often imports
+``EnvConfig`` for an annotation, or constants that name observations, and a caller's configuration
+is an instance of a class of LeRobot. LeRobot itself takes gigabytes, and seconds to import. The
+stub has the names of LeRobot's contract with environments; all other names come from LeRobot
+itself, if that is installed.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _GRANTED = ("HF_HOME", "HF_HUB_CACHE", "HUGGINGFACE_HUB_CACHE")
 
 
 def make_hub_cache(spec: JailSpec) -> None:
-    """Lay out the cache in the jail's home. All runners of a jail make the same there."""
+    """Lay out the cache in the jail's home. All runners of a jail make the same cache."""
     if any(name in spec.confinement.environment for name in _GRANTED):
         return
     for copy in spec.hub_copies:
@@ -72,8 +72,8 @@ _running: list[subprocess.Popen[bytes]] = []
 
 
 def check_display(spec: JailSpec, environment: Mapping[str, str]) -> None:
-    """Look for the program that a display needs, before anything is given up.
-    Raises ``LayerUnavailableError``: the policy asks for a display, and it is not there.
+    """Check that Xvfb is installed, before this process gives up any right.
+    Raises ``LayerUnavailableError``: the policy asks for a display, and Xvfb is missing.
     """
     is_virtual = spec.confinement.display == "virtual"
     if is_virtual and shutil.which(_PROGRAM, path=environment.get("PATH")) is None:
@@ -86,10 +86,10 @@ def check_display(spec: JailSpec, environment: Mapping[str, str]) -> None:
 
 
 def start_display(spec: JailSpec) -> None:
-    """Start the display of this process, where it is to have one, and name it in its environment.
+    """Start this process's display, if the policy has one, and set ``DISPLAY``.
 
-    Call it once confined: what is started then is as confined. It ends with this process's session.
-    Raises ``SystemExit``: it did not come up; the text says so.
+    Call this function in the confined process: the display inherits the confinement. It ends with
+    this process's session. Raises ``SystemExit``: the display did not start.
     """
     if spec.confinement.display != "virtual":
         return
@@ -112,7 +112,7 @@ def start_display(spec: JailSpec) -> None:
 
 
 def _line(ready: int) -> bytes:
-    """The number of the display that Xvfb writes; empty or incomplete if it ends or is too slow."""
+    """Reads the display's number from Xvfb; empty or incomplete if Xvfb ends or is too slow."""
     text = b""
     while b"\n" not in text and select.select([ready], [], [], _START_S)[0]:
         piece = os.read(ready, 16)
@@ -146,14 +146,14 @@ def install_lerobot_stub() -> None:
 
 
 class _Stub(MetaPathFinder, Loader):
-    """Finds and loads the modules of ``_MODULES``, until something else of LeRobot is asked for:
-    then LeRobot itself takes its place, if it is installed.
+    """Finds and loads the modules of ``_MODULES``. When the repository imports another part of
+    LeRobot, LeRobot itself replaces the stub, if it is installed.
     """
 
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: object = None
     ) -> ModuleSpec | None:
-        """The spec of a module of the stub, or of LeRobot's own."""
+        """Returns the spec of a module of the stub or of LeRobot itself."""
         if name in _MODULES:
             return ModuleSpec(name, self, origin="stub of envhub-sandbox", is_package=True)
         if name.startswith("lerobot.") and self._step_aside():
@@ -161,10 +161,10 @@ class _Stub(MetaPathFinder, Loader):
         return None
 
     def create_module(self, spec: ModuleSpec) -> None:
-        """An ordinary one."""
+        """Returns None: the import system makes an ordinary module."""
 
     def exec_module(self, module: types.ModuleType) -> None:
-        """Fill it; the first warns, if LeRobot is not installed."""
+        """Fill a module of the stub; the first one warns if LeRobot is not installed."""
         name = module.__name__
 
         def other(attribute: str) -> Any:
@@ -197,7 +197,9 @@ class _Stub(MetaPathFinder, Loader):
 
 
 class _AnyOfThisName(ABCMeta):
-    """The metaclass of the stub's classes: LeRobot's own classes of the same name are instances."""
+    """The metaclass of the stub's classes: instances of LeRobot's class of the same name pass
+    ``isinstance``.
+    """
 
     def __instancecheck__(cls, instance: Any) -> bool:
         name = (cls.__module__, cls.__qualname__)
@@ -232,17 +234,17 @@ def _configs() -> dict[str, Any]:
 
         @classmethod
         def register_subclass(cls, name: str) -> Callable[[type[Any]], type[Any]]:
-            """Nothing looks a configuration up by its name here."""
+            """Returns the class unchanged: nothing here looks up configurations by name."""
             return lambda kind: kind
 
         @property
         def gym_kwargs(self) -> dict[str, Any]:
-            """A repository's ``make_env`` gets its arguments by itself."""
+            """No arguments: the repository's ``make_env`` chooses its own."""
             return {}
 
     @dataclass
     class HubEnvConfig(EnvConfig):
-        """A repository of the Hub."""
+        """The configuration of an environment from a repository of the Hub."""
 
         hub_path: str | None = None
 

@@ -1,12 +1,12 @@
-"""A runner, from its fork to the first line of the code that serves it.
+"""A runner from its fork to the call of its target: confinement, packages, start.
 
-Everything here runs before anything of the repository does. The order is the point: what needs
-a privilege comes before its drop, and the syscall filter comes last.
+Everything here runs before the repository's code. The order matters: each step that needs a
+privilege comes before that privilege is dropped, and the system call filter comes last.
 
-Packages of a repository's own are brought in after that, and not before: such a folder holds a
-stranger's code, and much of it would run by itself: the lines of ``.pth`` files, plugins that
-another package imports, and whatever it calls ``numpy``. So the zygote of such jails runs without
-``site``, never has the folder on its path, and imports the standard library only.
+A repository's own packages are added after the filter. Their folder holds a stranger's code, much
+of which runs unasked: lines of ``.pth`` files, plugins that another package imports, any module
+named ``numpy``. So the zygote of such jails runs without ``site``, never has the folder on its
+path, and imports the standard library only.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ def run(jail: JailContext, fds: list[int], status: int, runners: int) -> NoRetur
     """Confine this freshly forked process, report, and run the target. Never returns.
 
     Args:
-        fds: The stream to the server, then whatever the server passes through.
+        fds: The stream to the server, then further descriptors from the server.
         status: Socket for the report to init; closed before the target runs.
-        runners: How many the jail has, this one included.
+        runners: The jail's number of runners, this one included.
     """
     code = 1
     try:
@@ -52,7 +52,7 @@ def run(jail: JailContext, fds: list[int], status: int, runners: int) -> NoRetur
     except BaseException:
         traceback.print_exc()
     finally:
-        # Not sys.exit: the zygote's atexit handlers and init's frames are not ours to run.
+        # Not sys.exit, which would run the zygote's atexit handlers and unwind init's frames.
         _flush()
         os._exit(code & 0xFF)
 
@@ -77,7 +77,7 @@ def _run(jail: JailContext, fds: list[int], init: Channel, runners: int) -> int:
 def _main(
     jail: JailContext, runners: int
 ) -> Callable[[socket.socket, JailSpec, list[int]], int | None]:
-    """Import the runner's main function, after the environment's own packages if it has any."""
+    """Import the runner's main function, after adding the repository's own packages, if any."""
     config = jail.common.config
     if not config.packages:
         return _resolve(config.target)
@@ -100,7 +100,7 @@ def _resolve(target: str) -> Callable[[socket.socket, JailSpec, list[int]], int 
 
 
 def confine(jail: JailContext, fds: list[int], init: Channel) -> None:
-    """Give up everything that the jail does not need."""
+    """Give up every right that the jail does not need."""
     # In this order: the end of init is our end from the first line on. A session of our own is
     # what init ends orphans by. The control group is joined before anything is allocated that it
     # should count, and while its descriptors are open: the next line but one closes them. The
@@ -119,7 +119,7 @@ def confine(jail: JailContext, fds: list[int], init: Channel) -> None:
 
 
 def _forget_the_zygote(jail: JailContext) -> None:
-    """Own environment, folders and random numbers; a fork shares them all with its siblings."""
+    """Set our own environment, folders and random numbers: all forks inherit the zygote's."""
     scratch, granted = jail.scratch, jail.spec.confinement.environment
     network = jail.spec.confinement.network
     built = jail_environment(os.environ, granted, scratch.home, scratch.temporary, network)
@@ -153,8 +153,8 @@ def _flush() -> None:
 def _bring_in(folder: str, home: str) -> None:
     """Turn this confined process into an interpreter with the packages in ``folder``.
 
-    They come behind the standard library, with their ``.pth`` files and the names that ``site``
-    adds to builtins. Programs that it starts as ``sys.executable`` have them as well.
+    They come after the standard library on the path, with their ``.pth`` files and the names that
+    ``site`` adds to builtins. Programs started as ``sys.executable`` have them, too.
     ``home``: the jail's own home, where each of its runners makes the same environment.
     """
     environment = f"{home}/.environment"
@@ -170,7 +170,7 @@ def _bring_in(folder: str, home: str) -> None:
 
 
 def _make_environment(environment: str, folder: str) -> None:
-    """A virtual environment, as ``venv`` makes it, around packages that lie elsewhere."""
+    """Make a virtual environment, like ``venv``, with packages from another folder."""
     major, minor = sys.version_info[:2]
     library = f"{environment}/lib/python{major}.{minor}"
     binaries = f"{environment}/bin"

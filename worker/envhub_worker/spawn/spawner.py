@@ -1,7 +1,7 @@
 """The server's side of a zygote and of the jails that it forks. Nothing here blocks.
 
-A ``Spawner`` is one zygote. ``spawn`` gives a ``Jail`` at once; what becomes of it arrives as
-events from ``Spawner.poll`` and ``Jail.poll``, whenever their descriptors are readable.
+A ``Spawner`` is one zygote. ``spawn`` returns a ``Jail`` at once. ``Spawner.poll`` and
+``Jail.poll`` return later events; call them when their descriptors are readable.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ RUNNER_TARGET = "envhub_worker.runner.runner:main"
 
 @dataclass(frozen=True)
 class ZygoteDied:
-    """The zygote has gone, and every jail with it.
+    """The zygote has ended, and every jail with it.
     ``code``: its exit code, or minus the signal that ended it.
     """
 
@@ -47,7 +47,7 @@ class ZygoteDied:
 
 @dataclass(frozen=True)
 class JailExited:
-    """The init of ``jail`` has gone, and every process of the jail with it."""
+    """The init of ``jail`` has ended, and every process of the jail with it."""
 
     jail: Jail
     code: int | None
@@ -73,9 +73,10 @@ class Spawner:
         """Execute the zygote; it preloads in the background.
 
         Args:
-            confinement: What the zygote's jails have in common.
-            target: What a confined runner runs: ``"module:function"``, or ``"/a.py:function"``.
-            ahead: A process to use, if it was started as this one would be; else it is ended.
+            confinement: The confinement that the zygote's jails share.
+            target: The function that confined runners call: ``"module:function"``, or
+                ``"/a.py:function"``.
+            ahead: A zygote process started earlier; used if it has the right arguments, else ended.
         """
         self._jails: dict[int, Jail] = {}
         self._count = 0
@@ -117,7 +118,7 @@ class Spawner:
         self._channel.send(asdict(config))
 
     def _make_scratches(self, confinement: Confinement) -> Path | None:
-        """Where jails without a mount namespace have their writable folders, if they need one."""
+        """Makes the parent of writable folders for jails without a mount namespace, if needed."""
         if confinement.profile == "strict":
             return None
         if self._user is None:
@@ -135,11 +136,11 @@ class Spawner:
         return None
 
     def fileno(self) -> int:
-        """Readable when ``poll`` has something to say."""
+        """A descriptor that is readable when ``poll`` has events."""
         return self._channel.fileno()
 
     def poll(self) -> list[SpawnerEvent]:
-        """What has happened since the last call."""
+        """Returns the events since the last call."""
         if self._exited:
             return []
         self._channel.flush()
@@ -174,10 +175,10 @@ class Spawner:
         self._jails.clear()
 
     def _reap_zygote(self) -> int:
-        """Wait for the zygote, and with it for everything that it started."""
+        """Wait for the end of the zygote and of all processes that it started."""
         code = self._process.wait()
         if self._pidfd >= 0:
-            # Under namespaces it is a child of the process that we started, killed with it.
+            # With namespaces the zygote is a child of the started process, and is killed with it.
             poller = select.poll()  # of descriptors beyond 1023, too
             poller.register(self._pidfd, select.POLLIN)
             poller.poll(_END_S * 1000)
@@ -190,7 +191,7 @@ class Spawner:
         if self._exited:
             raise RuntimeError("the zygote has ended")
         self._count += 1
-        # Mounts and Landlock know real paths only.
+        # Mounts and Landlock need real paths.
         spec = replace(spec, snapshot=os.path.realpath(spec.snapshot))
         folder = None if self._scratches is None else self._scratches / f"jail-{self._count}"
         jail = Jail(spec, folder, self._user)
@@ -231,7 +232,9 @@ class Spawner:
 
 
 def _keep(packages: str) -> int | None:
-    """Keep packages from being removed: a descriptor with the lock of their record, if any."""
+    """Returns a descriptor that holds the lock of the packages' record, so that nobody removes
+    them; None without a record.
+    """
     if not packages:
         return None
     record = os.path.join(os.path.dirname(os.path.realpath(packages)), RECORD)

@@ -4,11 +4,11 @@ It is executed with ``-I``, a built environment and named descriptors, never run
 code and never sees what a jail is for: a jail's specification, with the secrets that its caller
 may grant, goes straight from the server to the jail's init, so that no later fork inherits it.
 
-argv: the descriptor of its control channel, and what shall be imported at once, and not only when
-it is confined: ``ahead`` for what every runner needs, ``standard`` for no more than the standard
-library, where the packages of its jails are not the interpreter's own. The first message on the
-channel is its configuration (a command line can be read by every jail), with the fields of
-``ZygoteConfig``. Then requests::
+argv: the descriptor of its control channel, and which modules to import at once, before the
+confinement: ``ahead`` for all that runners need, ``standard`` for the standard library only, if the
+packages of its jails are not the interpreter's own. The first message on the channel is the
+configuration with the fields of ``ZygoteConfig`` (every jail could read a command line). Then
+requests::
 
     {"op": "spawn", "id": N} + [init's control socket, the jail's output pipe]
 
@@ -44,13 +44,14 @@ from envhub_worker.lockdown.stages import zygote
 from envhub_worker.spawn import blas, jail_init
 from envhub_worker.spawn.channel import Channel, close_fds
 
-# What nearly every runner imports anyway. pyzmq is left out on purpose: a jail holds no ZeroMQ
+# Modules that nearly every runner imports. pyzmq is left out on purpose: a jail holds no ZeroMQ
 # socket, and a context started here would not survive the fork.
 _PRELOAD = (
     *("cloudpickle", "ctypes", "gymnasium", "gymnasium.spaces", "gymnasium.vector"),
     *("gymnasium.wrappers", "msgpack", "numpy", "numpy.random", "tempfile", "typing"),
 )
-# Of the standard library, what numpy and Gymnasium import: the zygote may, it is the interpreter's.
+# Modules of the standard library that numpy and Gymnasium import. They belong to the interpreter,
+# so the zygote may import them.
 _STANDARD = (
     *("contextvars", "csv", "ctypes", "datetime", "difflib", "heapq", "importlib.metadata"),
     *("importlib.resources", "ipaddress", "locale", "logging", "mmap"),
@@ -91,7 +92,7 @@ def main(argv: Sequence[str]) -> int:
         refuse(channel, error)
         return 0
     process.become_subreaper()
-    # what a repository prints must not lie in a buffer when its process dies
+    # A repository's output must not be lost in a buffer when its process dies.
     cast(io.TextIOWrapper, sys.stdout).reconfigure(line_buffering=True)
     if not config.packages:
         preload(config.target)
@@ -103,19 +104,19 @@ def main(argv: Sequence[str]) -> int:
 
 
 def preload(target: str) -> None:
-    """Import what every runner needs: our own code and libraries, nothing of a repository."""
+    """Import the modules that every runner needs: our own code and libraries, no repository's."""
     module, _, _ = target.partition(":")
     import_all([*_PRELOAD, *([] if module.endswith(".py") else [module])])
 
 
 def import_all(modules: Iterable[str]) -> None:
-    """Import each of a list of our own."""
+    """Import each module of a list."""
     for module in modules:
         importlib.import_module(module)
 
 
 def refuse(channel: Channel, error: LayerUnavailableError) -> None:
-    """Answer every request for a jail with the layer that this host cannot enforce."""
+    """Answer every request for a jail with the missing layer of this host."""
     while received := channel.receive():
         message, (control, output) = received
         jail_init = Channel(socket.socket(fileno=control))
@@ -140,7 +141,7 @@ class Zygote:
         poller = select.poll()
         poller.register(self._channel, select.POLLIN)
         poller.register(wakeup, select.POLLIN)
-        # Our own end is known by this handle; the pid that the server started may only wait.
+        # The server learns of our end by this pidfd: the process that it started may only wait.
         self._channel.send_pidfd({"event": "ready"}, os.getpid())
         while self._running:
             ready = [fd for fd, _ in poller.poll()]
@@ -185,12 +186,12 @@ class Zygote:
                 fields = process.exit_fields(status)
                 self._channel.send({"event": "exited", "id": jail, **fields})
         if gone:
-            # An init that was killed leaves its orphans to us.
+            # An init that was killed leaves its orphans to this process, its subreaper.
             reap.kill_descendants(keep=self._inits)
 
     def _end(self) -> None:
-        # Every init sees its own channel end; give it the time to end its jail. What is left then
-        # is killed: orphans become children of this process, so it finds them all.
+        # Every init sees its own channel end and gets time to end its jail. Then the remaining
+        # processes are killed: orphans become children of this process, so it finds them all.
         deadline = time.monotonic() + _END_S
         while self._inits and time.monotonic() < deadline:
             self._reap()

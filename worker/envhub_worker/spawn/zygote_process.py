@@ -1,8 +1,9 @@
 """The process of a zygote, from its start until it reads its configuration.
 
-What a server needs first is a zygote, and that takes longest: so ``serve --ahead`` starts one
-before anything else is imported. In the server's own interpreter it imports what every runner
-needs; in another one, or where jails bring packages of their own, no package at all. Then it waits.
+A server needs a zygote first, and its start takes longest. So ``serve --ahead`` starts one before
+the server imports anything else. In the server's own interpreter the zygote imports all modules
+that runners need; in another interpreter, or if jails bring their own packages, it imports no
+package. Then it waits.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _END_S = 8.0
 
 
 def resolved(runtime: Runtime) -> Runtime:
-    """The runtime with the path of its interpreter filled in."""
+    """Returns the runtime with the path of its interpreter filled in."""
     return Runtime(runtime.python or sys.executable, runtime.packages)
 
 
@@ -31,17 +32,17 @@ class ZygoteProcess:
     """Owns the process, its channel, and a private folder.
 
     Args:
-        runtime: Its interpreter, and the packages of its jails. Where it has any, it starts without
-            ``site``, and so sees none: not those, and not the interpreter's own.
-        ahead: Import before the configuration comes, and so before any confinement. Only done with
-            the server's own interpreter, whose packages the server itself has imported.
-        granted: The variables of its jails.
+        runtime: The zygote's interpreter and the packages of its jails. With such packages the
+            zygote starts without ``site`` and sees no packages, not even the interpreter's own.
+        ahead: Whether to import before the configuration comes, so before any confinement. Only
+            done in the server's own interpreter, whose packages the server itself has imported.
+        granted: The environment variables of its jails.
 
     Attributes:
-        environment: What it was executed with.
-        channel: Its first message is the configuration.
-        folder: Removed by ``Spawner.close``.
-        pid: Of the process that was started; under namespaces it only waits for the zygote.
+        environment: The environment that it was executed with.
+        channel: The control channel; its first message is the configuration.
+        folder: A private folder, removed by ``Spawner.close``.
+        pid: The started process; with namespaces it only waits for the zygote.
     """
 
     def __init__(
@@ -77,13 +78,13 @@ class ZygoteProcess:
         self.pid = self._process.pid
 
     def serves(self, runtime: Runtime, granted: Mapping[str, str]) -> bool:
-        """Whether it was started as the zygote of such jails would be."""
+        """Whether the process was started with the arguments that these jails need."""
         runtime = resolved(runtime)
         environment = zygote_environment(os.environ, runtime.python, at_start(granted))
         return (self.runtime, self.environment) == (runtime, environment)
 
     def wait(self) -> int:
-        """Its exit code; it is killed if it does not end by itself soon."""
+        """Returns the exit code; kills the process if it does not end soon."""
         try:
             return self._process.wait(_END_S)
         except subprocess.TimeoutExpired:
@@ -91,7 +92,7 @@ class ZygoteProcess:
             return self._process.wait()
 
     def discard(self) -> None:
-        """End it unused."""
+        """End the process unused."""
         self.channel.close()
         self._process.kill()
         self._process.wait()

@@ -1,1 +1,1 @@
-"""The jails of a server: opened, asked, watched and ended."""
+"""Manages the jails of a server: opens them, passes requests, watches and ends them."""

@@ -1,8 +1,9 @@
-"""The descriptor socket: how a client's slabs and doorbells get to a runner.
+"""The descriptor socket, over which a client's slabs and doorbells get to a runner.
 
 ZeroMQ carries no descriptors, so they come over a ``SOCK_SEQPACKET`` socket in the server's
-private folder and wait here until the runner's ``Attach`` takes them along. The server does not
-decode that: the operation of its ``Relay`` says so. One request a connection, none keeps it busy.
+private folder and wait here until the server sends them with the runner's ``Attach``. The server
+does not decode an ``Attach``: it knows it by the operation of its ``Relay``. A connection carries
+one request, and no connection can block the server.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ may not have it."""
 
 
 class FdStore:
-    """Descriptors that wait for their runner, and the socket that takes them."""
+    """Descriptors that wait for their runner, and the socket that receives them."""
 
     def __init__(self, path: str, pidfd_for: PidfdFor) -> None:
         self._pidfd_for = pidfd_for
@@ -36,11 +37,11 @@ class FdStore:
         self._listener.setblocking(False)
 
     def fileno(self) -> int:
-        """Readable when a client is there."""
+        """A descriptor that is readable when a client connects."""
         return self._listener.fileno()
 
     def accept(self) -> None:
-        """Serve one client. Clients are ours: the folder is private and the session is checked."""
+        """Serve one client. It is trusted: the folder is private and its session is checked."""
         try:
             connection, _ = self._listener.accept()
         except OSError:
@@ -70,12 +71,12 @@ class FdStore:
             close_fds(fds)
 
     def put(self, jail: int, runner: int, fds: list[int]) -> None:
-        """Keep descriptors for a runner in place of earlier ones; they are ours from now on."""
+        """Take ownership of descriptors for a runner; they replace earlier ones."""
         close_fds(self._waiting.pop((jail, runner), []))
         self._waiting[jail, runner] = fds
 
     def take(self, jail: int, runner: int) -> list[int]:
-        """The descriptors for a runner; the caller closes them."""
+        """Returns the descriptors for a runner; the caller closes them."""
         return self._waiting.pop((jail, runner), [])
 
     def drop(self, jail: int) -> None:

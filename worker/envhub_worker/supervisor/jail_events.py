@@ -1,8 +1,8 @@
-"""What happens to jails: they come up, answer, print, break rules and die.
+"""Handles events of jails: they start, answer, print, break rules and die.
 
-None of it is asked for. Requests are in ``jails.py``; what both do to a jail is here, such as its
-end. Trust: a runner is hostile. What it says is not decoded, only its sizes and order are checked,
-and one that breaks the rules loses its jail.
+``jails.py`` handles requests; actions that events and requests share, such as the end of a jail,
+are here. Trust: a runner is hostile. The server does not decode its messages and checks only their
+sizes and order; a runner that breaks the rules loses its jail.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ MAX_DEAD = 256
 
 
 class JailEvents:
-    """Writes down what happens, and tells everybody who waits for it.
-    ``jails``: all jails of the server; what has ended long ago is taken out.
+    """Records events of jails and answers the requests that wait for them.
+    ``jails``: all jails of the server; this class removes those that ended long ago.
     ``deaths``: how many jails, and runners of kept jails, have ended unasked, by reason.
     """
 
@@ -58,19 +58,19 @@ class JailEvents:
         self._outer_limit = SurroundingLimit()
 
     def follow(self, entry: JailRecord) -> None:
-        """Hear of a new jail from now on."""
+        """Watch a new jail."""
         self._watch(entry, entry.control, partial(self._jail_events, entry))
         self._watch(entry, entry.output.fileno(), partial(self._read_output, entry))
 
     def follow_runner(self, entry: JailRecord, runner: int) -> None:
-        """Hear of a new runner from now on."""
+        """Watch a new runner."""
         self._watch(entry, entry.links[runner].fileno(), partial(self._runner_ready, entry, runner))
 
     def _watch(self, entry: JailRecord, fd: int, callback: Callable[[], None]) -> None:
         self._loop.watch(fd, self._guarded(entry, callback))
 
     def _guarded(self, entry: JailRecord, callback: Callable[[], None]) -> Callable[[], None]:
-        """A callback whose exceptions end the jail, and not the server."""
+        """Returns a callback whose exceptions end the jail instead of the server."""
 
         def guarded() -> None:
             try:
@@ -83,7 +83,7 @@ class JailEvents:
         return guarded
 
     def share(self, link: RunnerLink, slabs: ServedSlabs) -> None:
-        """From now on the server steps a runner by these slabs."""
+        """Step a runner by these slabs from now on."""
         self._part_with(link)
         link.slabs = slabs
         self._steps.add(slabs)
@@ -136,7 +136,7 @@ class JailEvents:
             self.gather(pending)
 
     def gather(self, pending: Pending) -> None:
-        """Answer a ``Relay``, once all that were asked have answered or died."""
+        """Answer a ``Relay`` if each of its runners has answered or died."""
         replies = [frames for frames in pending.replies if frames is not None]
         if len(replies) == len(pending.replies):
             payload = [frame for frames in replies for frame in frames]
@@ -152,7 +152,7 @@ class JailEvents:
             entry.output.close()
 
     def catch_up(self, entry: JailRecord) -> None:
-        """Handle a jail's events now, as the loop would in a moment."""
+        """Handle a jail's waiting events now, which the loop would handle a moment later."""
         if entry.death is None and entry.jail.fileno() >= 0:
             self._jail_events(entry)
 
@@ -207,7 +207,7 @@ class JailEvents:
         return death
 
     def close(self) -> None:
-        """The server ends, and nothing is left of any jail."""
+        """Report the last jails as closed, at the end of the server."""
         for entry in self._jails.values():
             if entry.death is None and not entry.released:
                 self._witness.closed(entry)
@@ -215,18 +215,21 @@ class JailEvents:
         self._outer_limit.close()
 
     def _runner_died(self, entry: JailRecord, death: m.Death) -> None:
-        """End the jail too, unless it is kept."""
+        """End the jail of a dead runner, unless the client keeps it (``KeepJail``)."""
         if not entry.kept:
             self.end(entry, death)
         elif entry.death is None and death.runner in entry.links:
             self._lose(entry, death)
 
     def _lose(self, entry: JailRecord, death: m.Death) -> None:
-        """Go on without a runner: the requests that wait for it are answered with its death."""
+        """Go on without a runner, and answer the requests that wait for it with its death."""
+        # In this order. The runner is killed first: it may live and have broken the rules. Its last
+        # step is taken before the waiting requests are answered, for it may have finished that
+        # step. The slabs and the stream are closed only when nobody reads them any more.
         self.deaths[death.reason] += 1
         entry.output.read()
         death = m.replace(death, tail=entry.output.text())
-        # the last lines of earlier deaths were sent already: all of them would be much
+        # The clients have the output of earlier deaths already; drop it to save memory.
         entry.lost = {runner: m.replace(lost, tail="") for runner, lost in entry.lost.items()}
         entry.lost[death.runner] = death
         entry.jail.kill_runner(death.runner)  # it may live, and have broken the rules
@@ -249,7 +252,10 @@ class JailEvents:
         self._witness.lost(entry, death)
 
     def end(self, entry: JailRecord, death: m.Death) -> None:
-        """Record the jail's death, answer everybody who waits, and kill its processes."""
+        """Record the jail's death, answer all waiting requests, and kill its processes."""
+        # In this order. Denials, finished steps and output that still wait in the jail's channels
+        # are read first. Then ``entry.death`` is set, so that a second ``end`` returns at once.
+        # Requests are answered from it, and only then are the processes killed.
         if entry.death is not None:
             return
         self.deaths[death.reason] += 1
@@ -267,9 +273,9 @@ class JailEvents:
         self.kill(entry)
 
     def _hear_last(self, entry: JailRecord) -> None:
-        """Drain the control channel before the jail is ended: denials may still lie in it.
+        """Read the last denials from the control channel before the jail ends.
 
-        A channel that cannot be read is no reason not to end the jail.
+        An unreadable channel must not keep the jail from ending.
         """
         try:
             events = entry.jail.poll()
@@ -284,18 +290,18 @@ class JailEvents:
         entry.denied.append(f"{event.call} {event.detail}".strip())
 
     def kill(self, entry: JailRecord) -> None:
-        """End its processes; ``jail_gone`` is when they are gone."""
+        """Start to end a jail's processes; ``jail_gone`` follows when all have ended."""
         self._fds.drop(entry.number)
         self._unwatch_control(entry)
         entry.jail.kill()
 
     def _unwatch_control(self, entry: JailRecord) -> None:
-        """Only once: afterwards the descriptor's number may belong to another file."""
+        """Stop watching the control channel, once: its number may belong to another file later."""
         self._loop.unwatch(entry.control)
         entry.control = -1
 
     def jail_gone(self, event: JailExited) -> None:
-        """Nothing of a jail is left: answer the requests that wait for that."""
+        """Release a jail whose processes have all ended, and answer requests that wait for that."""
         entry = next((jail for jail in self._jails.values() if jail.jail is event.jail), None)
         if entry is None:
             return
@@ -328,13 +334,13 @@ class JailEvents:
         for pending in unanswered:
             death = whole_jail("killed", detail="the jail was closed")
             self._reply(pending.asker, m.replace(death, operation=pending.operation))
-        # the oldest dead, where there are many: their clients do not come back for them
+        # Forget the oldest of many dead jails: their clients have not asked about them for long.
         dead = [number for number, jail in self._jails.items() if jail.released]
         for number in dead[:-MAX_DEAD]:
             del self._jails[number]
 
     def zygote_died(self, key: tuple[object, ...], event: ZygoteDied) -> None:
-        """A zygote has gone, and every jail with it."""
+        """End every jail of a zygote that has ended."""
         for entry in list(self._jails.values()):
             if entry.zygote == key and not entry.released:
                 self.end(entry, whole_jail("zygote", exit_code=event.code, detail=event.log))

@@ -1,9 +1,9 @@
-"""The jails of a worker server, as its clients ask for them: opened, asked, read and closed.
+"""Handles clients' requests about jails: opens them, relays requests, reads output, closes them.
 
-And their zygotes: one for each runtime, and each part of a policy that it needs; started when a
-jail needs one, ended when they are too many.
+It also manages their zygotes, one for each runtime and each part of a policy that a zygote needs.
+It starts a zygote when a jail needs one and ends idle zygotes if there are too many.
 
-Trusted code. What happens to a jail without being asked for is in ``jail_events.py``.
+Trusted code. ``jail_events.py`` handles the events of jails.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ _Zygote = tuple[Any, ...]  # its name: a runtime, variables, and these parts of 
 
 class Jails:
     """All jails of a server.
-    ``fd_path``: the socket that takes descriptors; ``ahead``: a process for the first zygote.
-    ``deaths``: how many have ended unasked since the start, by reason.
+    ``fd_path``: the socket that receives descriptors; ``ahead``: a process for the first zygote.
+    ``deaths``: number of jails, by reason, that have ended without a request.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Jails:
         self._events.close()
         self._fds.close()
 
-    # --- requests: what is returned is the reply; None, where that comes later ------------------
+    # --- requests: each method returns the reply, or None if the reply comes later --------------
 
     def open(self, asker: Asker, request: m.OpenJail) -> None:
         """Fork a jail for a snapshot, and its first runners."""
@@ -130,7 +130,7 @@ class Jails:
             confinement=confinement,
             hub_copies=copies,
         )
-        # a zygote is one environment's: not even what it has not imported is shared with another
+        # A zygote belongs to one runtime: jails with other packages never share its memory.
         started_with = frozenset(at_start(confinement.environment).items())
         of_policy = (getattr(confinement, name) for name in _OF_POLICY)
         zygote = (request.runtime, started_with, *of_policy)
@@ -176,12 +176,12 @@ class Jails:
             )
 
     def _wire_limits(self, entry: JailRecord) -> WireLimits:
-        """The limits that the client chose; for a client on another host at most our own."""
+        """Returns the client's wire limits; for a client on another host at most our own."""
         most = entry.jail.spec.confinement.limits.message_bytes
         return limits_for(most if self._local else min(most, DEFAULT_LIMITS.message_bytes))
 
     def _output_bytes(self, confinement: Confinement) -> int:
-        """Likewise for output, which the server keeps in its own memory."""
+        """Returns the bytes of output to keep in the server's memory, limited like the wire's."""
         most = confinement.limits.output_bytes
         return most if self._local else min(most, MAX_SERVED_OUTPUT)
 
@@ -199,7 +199,7 @@ class Jails:
         entry.opening.append(Opening(asker, set(runners), tuple(runners)))
 
     def relay(self, asker: Asker, request: m.Relay, payload: list[bytes]) -> None:
-        """Hand the payload to runners; the reply goes out once all of them have answered."""
+        """Pass the payload to runners; the reply goes out once all of them have answered."""
         entry = self._owned(asker, request.jail)
         targets = _targets(entry, request, payload)
         if targets is None:
@@ -250,7 +250,8 @@ class Jails:
                 raise RefusedError("LocalProtocolError", f"runner {runner} owes an answer")
             if not words.served(leaves, request_bytes, observation_bytes, most):
                 raise RefusedError("WorkerError", f"no slabs are made as in {part}")
-            # what the server touches first is charged to the server, whatever bounds the jail
+            # The kernel charges a page to the process that touches it first. For these slabs that
+            # is the server, so the jail's own limits do not bound them.
             if entry.shared_bytes({runner}) + request_bytes + observation_bytes > room:
                 raise RefusedError("WorkerError", "its slabs would be more than memory_bytes")
             slabs = ServedSlabs(leaves, request_bytes, observation_bytes)
@@ -260,18 +261,18 @@ class Jails:
         return m.Done()
 
     def keep(self, asker: Asker, request: m.KeepJail) -> m.Message:
-        """From now on the death of a runner does not end the jail."""
+        """Keep a jail alive when one of its runners dies."""
         self._owned(asker, request.jail).kept = True
         return m.Done()
 
     def expire(self, asker: Asker, request: m.ExpireIdle) -> m.Message:
-        """Set after how long without a request a jail ends."""
+        """Set the time without requests after which a jail ends."""
         entry = self._owned(asker, request.jail)
         entry.idle = entry.idle or IdleTimer(request.idle_ms / 1000)
         return m.Done()
 
     def look(self) -> None:
-        """End the jails that have done nothing for longer than they may; about once a second."""
+        """End the jails that were idle for longer than their limit. Called about once a second."""
         for entry in self.open_ones():
             busy = any(link.owed for link in entry.links.values())
             if entry.idle is not None and entry.idle.passed(busy):
@@ -281,7 +282,7 @@ class Jails:
         entry = self._found(request.session, request.jail)
         if entry is None or entry.death is not None or request.runner not in entry.links:
             return None
-        # the zygote reports the jail, and may do so only after it has reported itself
+        # The pidfd may be -1: the zygote may report an init after that init has reported itself.
         return entry.jail.runner_pidfd(request.runner) if entry.kept else entry.jail.pidfd
 
     def _found(self, session: bytes, number: int) -> JailRecord | None:
@@ -289,7 +290,7 @@ class Jails:
         return entry if entry is not None and entry.session == session else None
 
     def _owned(self, asker: Asker, number: int, operation: str = "") -> JailRecord:
-        """The asker's living jail of this number. Raises the reply if there is none."""
+        """Returns the asker's live jail of this number. Raises the reply if there is none."""
         entry = self._found(asker.session, number)
         if entry is None:
             why = "it has been closed, or another task in it was given up, or the server is new"
@@ -299,7 +300,7 @@ class Jails:
         return entry
 
     def close_jail(self, asker: Asker, request: m.CloseJail) -> m.Message | None:
-        """End a jail; also after its death, for ``Done`` means that nothing of it is left."""
+        """End a jail, also after its death: ``Done`` means that all its processes have ended."""
         entry = self._found(asker.session, request.jail)
         if entry is not None and not entry.released:
             entry.closing.append(asker)
@@ -310,7 +311,7 @@ class Jails:
         return m.Done()
 
     def read_output(self, asker: Asker, request: m.ReadOutput) -> m.Message:
-        """The last lines that a jail printed."""
+        """Returns the last lines that a jail printed."""
         entry = self._owned(asker, request.jail, request.operation)
         if entry.idle is not None:
             entry.idle.begin()  # so that the request that follows finds it alive
@@ -318,7 +319,7 @@ class Jails:
         return m.Output(entry.output.text())
 
     def follow_output(self, asker: Asker, request: m.FollowOutput) -> m.Message:
-        """What a jail has printed since, also if it is dead."""
+        """Returns output after an offset, also of a dead jail."""
         entry = self._found(asker.session, request.jail)
         if entry is None:
             raise RefusedError("WorkerError", f"there is no jail {request.jail}")
@@ -326,7 +327,7 @@ class Jails:
         return m.OutputBytes(*entry.output.since(request.offset))
 
     def status(self, asker: Asker, request: m.GetStatus) -> m.Message:
-        """What the asker's jails are doing, and what they hold."""
+        """Returns the state and the resources of the asker's jails."""
         mine = [entry for entry in self._jails.values() if entry.session == asker.session]
         for entry in mine:
             self._events.catch_up(entry)  # it said so before it answered the client that asks now
@@ -352,7 +353,7 @@ class Jails:
         return spawner
 
     def _end_idle(self) -> None:
-        """End idle zygotes over the limit: ever new policies would fill the memory."""
+        """End idle zygotes over the limit: otherwise ever new policies would fill the memory."""
         used = {entry.zygote for entry in self._jails.values() if not entry.released}
         idle = [zygote for zygote in self._spawners if zygote not in used]
         for zygote in idle[: max(0, len(idle) - MAX_IDLE_ZYGOTES)]:
@@ -373,7 +374,7 @@ class Jails:
     # --- for the gate --------------------------------------------------------------------------
 
     def open_ones(self, owner: bytes = b"") -> list[JailRecord]:
-        """Jails that live, of sessions whose name begins like that."""
+        """Returns the live jails of sessions whose owner begins with a prefix."""
         return [
             entry
             for entry in self._jails.values()
@@ -382,15 +383,15 @@ class Jails:
 
     @property
     def packages(self) -> frozenset[str]:
-        """Folders of packages that a jail, or a zygote that waits for one, has mounted."""
+        """Returns the folders of packages that jails and idle zygotes have mounted."""
         return frozenset(runtime.packages for runtime, *_ in self._spawners)
 
     def statuses(self, owner: bytes) -> list[dict[str, object]]:
-        """What the jails of a session are doing."""
+        """Returns the states of a session's jails."""
         return [status_of(entry) for entry in self.open_ones(owner)]
 
     def end(self, entry: JailRecord, why: str) -> None:
-        """End a jail that no client closes; its client reads why if it comes back."""
+        """End a jail that no client closes. A client that comes back reads the reason."""
         self._events.end(entry, whole_jail("idle", detail=why))
 
 
@@ -406,7 +407,7 @@ def _held(entry: JailRecord, children: Children | None) -> dict[str, object]:
 
 
 def _note_limits(entry: JailRecord, usage: dict[str, int]) -> None:
-    """List used up limits as denials, in front, where a flood of others cannot hide them."""
+    """Put exhausted limits in front of the denials, where a flood of others cannot hide them."""
     confinement = entry.jail.spec.confinement
     runners, own_root = entry.jail.runner_pids(), confinement.profile == "strict"
     limits = set(reached(confinement.limits, usage, runners, own_root=own_root))
@@ -418,7 +419,7 @@ def _note_limits(entry: JailRecord, usage: dict[str, int]) -> None:
 
 
 def _can_step(link: RunnerLink | None, frames: list[bytes]) -> bool:
-    """Whether a runner can be asked to step. A dead one can: its death is the answer."""
+    """Whether a runner accepts a step. A dead runner does: its death is the answer."""
     if link is None:
         return True
     slabs = link.slabs
@@ -428,7 +429,7 @@ def _can_step(link: RunnerLink | None, frames: list[bytes]) -> bool:
 def _targets(
     entry: JailRecord, request: m.Relay, payload: list[bytes]
 ) -> list[tuple[int, list[bytes]]] | None:
-    """The frames for each runner; None if the parts do not match the runners or the frames."""
+    """Returns the frames of each runner; None if parts, runners and frames do not match."""
     targets: dict[int, list[bytes]] = {}
     start = 0
     for part in request.parts:

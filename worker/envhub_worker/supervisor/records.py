@@ -1,5 +1,5 @@
-"""Records of a worker server: each of its jails, what it prints, how long it has been idle, the
-requests that wait for it, and ``Witness``, which is called about its events.
+"""Records of a worker server: its jails with their output, idle time and waiting requests; and
+``Witness``, whose methods are called for their events.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MAX_BYTES = 1 << 20
 
 class OutputTail:
     """The last ``limit`` bytes of a pipe that a jail writes to. Owns the descriptor.
-    ``ended``: nothing more will come.
+    ``ended``: whether the pipe is at its end.
     """
 
     def __init__(self, fd: int, limit: int) -> None:
@@ -47,7 +47,7 @@ class OutputTail:
         return self._fd
 
     def read(self) -> None:
-        """Take what is there. One read a call, so that a flood cannot hold up the server."""
+        """Read waiting output. One read per call, so that a flood cannot block the server."""
         if self._fd < 0 or self.ended:
             return
         try:
@@ -61,14 +61,14 @@ class OutputTail:
             del self._kept[: -self._limit]
 
     def since(self, offset: int) -> tuple[int, bytes]:
-        """Where the kept output from ``offset`` on begins, and the output itself."""
+        """Returns the kept output from ``offset`` on, after the offset where it really begins."""
         first = self._total - len(self._kept)
         start = min(max(offset, first), self._total)
         return start, bytes(self._kept[start - first : start - first + MAX_BYTES])
 
     def text(self, lines: int = 40) -> str:
-        """The last lines, fit for a terminal, without a first line that is cut off: a client
-        searches them for secrets, and would not recognise half of one.
+        """Returns the last lines, safe for a terminal. Drops a first line that is cut off: a client
+        searches the lines for secrets and would not recognise half a secret.
         """
         kept = bytes(self._kept[-self._limit :])
         if len(kept) < self._total:
@@ -88,7 +88,7 @@ _MAX_PAIRS = 128
 
 
 class IdleTimer:
-    """The clock of one jail."""
+    """Measures how long one jail has been idle."""
 
     def __init__(self, limit_s: float) -> None:
         self.limit_s = limit_s
@@ -97,13 +97,13 @@ class IdleTimer:
         self.begin()
 
     def begin(self) -> None:
-        """Restart the clock: something was asked, or answered."""
+        """Restart the clock, after a request or an answer."""
         self._since = monotonic()
 
     def watch(self, runner: int, fds: Sequence[int]) -> None:
-        """Count an environment's steps, too. Takes over its request slab and its reply slab.
+        """Count an environment's steps, too. Takes ownership of its request and reply slabs.
 
-        What a runner has closed is not told; of many environments the last ones are counted.
+        Runners do not report closed environments; if there are many, the last ones are counted.
         """
         pairs = self._slabs.setdefault(runner, [])
         pairs.append(fds)
@@ -111,17 +111,17 @@ class IdleTimer:
             close_fds(pairs.pop(0))
 
     def forget(self, runner: int) -> None:
-        """A runner has gone."""
+        """Forget a runner that has ended."""
         for fds in self._slabs.pop(runner, []):
             close_fds(fds)
 
     def close(self) -> None:
-        """Give all descriptors back."""
+        """Close all descriptors."""
         for runner in list(self._slabs):
             self.forget(runner)
 
     def passed(self, busy: bool) -> bool:
-        """Whether the limit has passed. ``busy``: a runner has a message to answer."""
+        """Whether the jail was idle longer than its limit. ``busy``: a runner owes an answer."""
         pairs = [pair for pairs in self._slabs.values() for pair in pairs]
         sequences = [_sequence(request) for request, _ in pairs]
         answered = [_sequence(reply) for _, reply in pairs]
@@ -140,9 +140,10 @@ _MAX_SAID = 4096
 
 
 class Asker(NamedTuple):
-    """Who asked: the reply goes to this identity under this id. Jails belong to its session.
+    """The sender of a request: the reply goes to its identity, with its id. Jails belong to its
+    session.
 
-    ``key`` was proved in the handshake; empty where none is needed.
+    ``key`` was proved in the handshake; empty if the server needs no keys.
     """
 
     identity: bytes
@@ -164,10 +165,10 @@ class AnsweredError(Exception):
 
 
 class RefusedError(AnsweredError):
-    """A request is not done. ``error`` is a name out of the client's table."""
+    """The server refuses a request. ``error`` is a name in the client's table."""
 
     def __init__(self, error: str, message: str, missing: str = "", fix: str = "") -> None:
-        # what the client has sent may be quoted in the message, at any length
+        # The message may quote the client's request, which may have any length.
         super().__init__(m.Refusal(error, message[:_MAX_SAID], missing, fix))
         self.error, self.message, self.missing, self.fix = error, message, missing, fix
 
@@ -177,7 +178,7 @@ class RefusedError(AnsweredError):
 
 @dataclass
 class Opening:
-    """An ``OpenJail`` or ``StartRunners`` whose runners have not all come up."""
+    """An ``OpenJail`` or ``StartRunners`` some of whose runners have not started yet."""
 
     asker: Asker
     waiting: set[int]
@@ -187,7 +188,7 @@ class Opening:
 
 @dataclass(slots=True)
 class Pending:
-    """A ``Relay`` that runners still owe answers to."""
+    """A ``Relay`` that waits for runners' answers."""
 
     asker: Asker
     operation: str
@@ -196,18 +197,18 @@ class Pending:
     since: float = field(default_factory=monotonic)
 
     def lost(self, index: int, death: m.Death) -> None:
-        """Record a runner's death in the place of its answer."""
+        """Record a runner's death in place of its answer."""
         self.dead.add(index)
         self.replies[index] = m.pack(m.replace(death, operation=self.operation))
 
 
 @dataclass
 class JailRecord:
-    """A jail and everything that waits for it.
+    """A jail and the requests that wait for it.
 
     Attributes:
-        moved: Bytes to and from runners that it has lost.
-        denied: What was tried in it and is denied, where it records that.
+        moved: Bytes to and from runners that have died.
+        denied: The denied attempts of its processes, if it records them.
     """
 
     number: int
@@ -231,11 +232,11 @@ class JailRecord:
     denied: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        # kept, because closing a descriptor makes it forget its number
+        # Kept, because a closed object no longer knows its descriptor's number.
         self.control = self.jail.fileno()
 
     def bytes_moved(self) -> tuple[int, int]:
-        """Bytes sent to its runners, and bytes received from them."""
+        """The bytes sent to its runners, and the bytes received from them."""
         sent, received = self.moved
         links = self.links.values()
         return sent + sum(link.sent for link in links), received + sum(
@@ -243,7 +244,7 @@ class JailRecord:
         )
 
     def shared_bytes(self, but: Collection[object] = ()) -> int:
-        """Size of the slabs that the server shares with its runners, except those in ``but``."""
+        """The bytes of slabs that the server shares with its runners, except those in ``but``."""
         others = (link.slabs for runner, link in self.links.items() if runner not in but)
         return sum(slabs.shared_bytes for slabs in others if slabs is not None)
 
@@ -255,7 +256,7 @@ class JailRecord:
 
 
 def waiting(entry: JailRecord) -> list[Pending]:
-    """The requests that runners have not answered; clears them."""
+    """Returns the requests that runners have not answered, and clears them."""
     states = {}
     for link in entry.links.values():
         for pending, _ in link.owed:
@@ -265,13 +266,13 @@ def waiting(entry: JailRecord) -> list[Pending]:
 
 
 def owes(entry: JailRecord, runner: int) -> int:
-    """How many requests a runner has not answered; 0 for one that has died."""
+    """Returns how many requests a runner has not answered; 0 if it has died."""
     link = entry.links.get(runner)
     return 0 if link is None else len(link.owed)
 
 
 def whole_jail(reason: Reason, **how: Any) -> m.Death:
-    """A death that was not one runner's; ``how`` are further fields of ``Death``."""
+    """Returns the death of a whole jail; ``how`` are further fields of ``Death``."""
     return m.Death(-1, reason, **how)
 
 
@@ -289,7 +290,7 @@ _STATES = {b"R": "running", b"S": "waiting", b"D": "waiting", b"T": "stopped", b
 
 
 def _state_of(pid: int) -> str:
-    """The state of a runner by the kernel: a busy environment cannot tell its own."""
+    """Returns a runner's state by the kernel: a busy environment cannot report its own."""
     try:
         return _STATES.get(procfs.stat(pid)[0], "gone")
     except (OSError, IndexError):
@@ -297,10 +298,10 @@ def _state_of(pid: int) -> str:
 
 
 def status_of(entry: JailRecord) -> dict[str, object]:
-    """What a jail is doing, for ``Status``."""
+    """Returns the state of a jail, for ``Status``."""
     owed = [pending for link in entry.links.values() for pending, _ in link.owed]
     oldest = min(owed, key=attrgetter("since"), default=None)
-    # in the order of the runners: they come up side by side, and say so in any order
+    # In the order of the runners, which start in parallel and report in any order.
     pids = tuple(entry.pids[runner] for runner in sorted(entry.pids))
     return {
         "jail": entry.number,
@@ -313,13 +314,13 @@ def status_of(entry: JailRecord) -> dict[str, object]:
 
 
 class Witness:
-    """Called about every jail. It must not raise, and must not keep what it is shown.
+    """Its methods are called for events of every jail. They must neither raise nor keep arguments.
 
-    This one writes nothing down: the server's client is on this machine, and logs by itself.
+    This class records nothing: the server's client is on this machine and keeps its own log.
     """
 
     def opened(self, entry: JailRecord, runners: int, seconds: float) -> None:
-        """A jail has come up, or further runners in it, so long after it was asked for."""
+        """A jail, or further runners in it, have started; with the time since the request."""
 
     def lost(self, entry: JailRecord, death: m.Death) -> None:
         """A runner has died in a jail that goes on."""
@@ -328,9 +329,9 @@ class Witness:
         """A jail is dead: ``entry.death`` says how."""
 
     def closed(self, entry: JailRecord) -> None:
-        """Nothing is left of a jail that its client has closed, or that the server ends with."""
+        """All processes of a jail have ended, after its client or the server has closed it."""
 
     def failed(self, error: Exception) -> None:
-        """The server itself has met an error, of which it does not die: on stderr."""
+        """Print an error of the server itself, which goes on, to stderr."""
         with contextlib.suppress(OSError, ValueError):  # stderr may have no reader any more
             traceback.print_exception(error)

@@ -22,9 +22,9 @@ class RunnerLink:
     """One runner's stream.
 
     Attributes:
-        pending: By the ids of the requests that it owes an answer to, oldest first.
-        watched: Whether somebody waits until it can be written to.
-        slabs: Where the server takes the runner's steps.
+        pending: The owners of unanswered requests by id, the oldest first.
+        watched: Whether the loop watches the stream for writing.
+        slabs: The slabs by which the server steps the runner, or None.
     """
 
     sock: socket.socket
@@ -60,13 +60,13 @@ class RunnerLink:
 
     @property
     def wants_write(self) -> bool:
-        """Whether something waits to be sent."""
+        """Whether unsent bytes wait."""
         return bool(self._unsent)
 
     def send(
         self, request_id: int, frames: Sequence[Buffer], owner: Any, fds: Sequence[int] = ()
     ) -> None:
-        """Queue a request and send what the socket takes. ``fds`` go along; they stay yours."""
+        """Queue a request and send as much as the socket takes. ``fds`` stay the caller's."""
         if fds:
             self._send_fds(request_id, frames, fds)
             self.pending[request_id] = owner
@@ -93,7 +93,7 @@ class RunnerLink:
             raise RuntimeError("the runner does not read its stream")
 
     def flush(self) -> None:
-        """Send what the socket takes. A runner that is gone is noticed by its exit."""
+        """Send as much as the socket takes. An ended runner is noticed by its exit event."""
         while self._unsent:
             batch = [self._unsent[i] for i in range(min(len(self._unsent), _MAX_IOVECS))]
             try:
@@ -109,8 +109,8 @@ class RunnerLink:
                 self._unsent[0] = self._unsent[0][sent:]
 
     def receive(self) -> list[tuple[Packet, Any]] | None:
-        """The replies that have arrived with their owners, or None at the end of the stream.
-        Raises ``RemoteProtocolError``: the runner sent what was not asked for. Trust: it is
+        """Returns the arrived replies with their owners, or None at the end of the stream.
+        Raises ``RemoteProtocolError``: the runner sent an unexpected packet. Trust: the runner is
         hostile.
         """
         try:
@@ -127,13 +127,13 @@ class RunnerLink:
             for packet in self._reader.feed(data):
                 answers.append((packet, self.pending.pop(packet.request_id)))
         except RemoteProtocolError:
-            # what came before the offence is dropped with it: its owners get the death
+            # Replies before the offence are dropped, too: their owners get the runner's death.
             self.pending.update((packet.request_id, owner) for packet, owner in answers)
             raise
         return answers
 
     def _check_owed(self, request_id: int) -> None:
-        """Refuse a reply that nobody asked for, before memory is allocated for it."""
+        """Refuse an unexpected reply before memory is allocated for it."""
         expected = next(iter(self.pending), None)
         if request_id != expected:
             raise RemoteProtocolError(

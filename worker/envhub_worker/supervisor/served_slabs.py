@@ -1,15 +1,15 @@
-"""Slabs of a runner whose client shares no memory with it: the server takes the steps for it.
+"""Slabs by which the server steps a runner for a client that shares no memory with the runner.
 
-The client is on another host, or has chosen frames. It sends its half of the request slab; what
-comes back is what the runner wrote into the other two. The server reads three words of those and
-understands none of the rest.
+The client is on another host, or has chosen frames. It sends its half of the request slab and gets
+the bytes that the runner wrote into the other two. The server reads three words of those and does
+not interpret the rest.
 
-Trust: a jail holds all of this, and the server is many clients'. Each word is read once; only its
-client's own bytes and bounded numbers decide what is sent. Nothing here waits: rings are sent and
-heard as ``descriptors`` says; a hole that is punched costs a fault for each page, of slabs whose
-size is bounded. A large observation is sent from where it lies. An honest runner writes it again
-only for the next step, which its client asks for when it has all of this one; another one decides
-what its client reads anyway.
+Trust: a jail can write all of these slabs, and the server has other clients. It reads each word
+once; only the client's own bytes and bounded numbers decide what it sends. It never waits: for
+doorbells see ``descriptors``; if a jail punches holes into the slabs, the server pays one page
+fault per page, and the slabs' size is bounded. A large observation is sent from the slab without a
+copy. An honest runner overwrites it only for the next step, which the client requests after it has
+received this one; a hostile runner decides what its client reads anyway.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ class ServedSlabs:
     """The slabs and doorbells of one runner, and at most one step that it owes.
 
     Attributes:
-        deposit: What the runner gets, to be taken once: three slabs, its doorbell, ours.
-        owner: Whom the step that it owes is for; None if it owes none.
-        awake_until: Until when an answer is worth waiting for awake.
-        shared_bytes: Of the two slabs whose size the client chooses.
+        deposit: The runner's descriptors, to be taken once: three slabs, its doorbell, ours.
+        owner: The owner of the unanswered step, or None.
+        awake_until: The time until which the server polls for the answer instead of sleeping.
+        shared_bytes: Size of the two slabs whose size the client chooses.
     """
 
     def __init__(self, leaves: int, request_bytes: int, observation_bytes: int) -> None:
@@ -85,11 +85,15 @@ class ServedSlabs:
         self.vain = 0
 
     def fits(self, frame: bytes) -> bool:
-        """Whether a client's half of the request slab is one."""
+        """Whether a frame has the size of a client's half of the request slab."""
         return self._words <= len(frame) <= self._room
 
     def ask(self, frame: bytes, owner: Any) -> None:
-        """Announce a step."""
+        """Write a step into the request slab and announce it."""
+        # In this order: the words and actions, then the sequence word, which the runner polls. The
+        # runner's parked word is read last: the runner parks and then looks at the sequence once
+        # more, so it sees this step or we see that it sleeps, and ring. A processor may reorder the
+        # two: the runner's first sleep is therefore short (``runner.main``).
         self.owner = owner
         asks, cut = self._asks, self._words
         self._request[words.OWN_BYTES : words.OWN_BYTES + cut] = frame[:cut]
@@ -107,20 +111,20 @@ class ServedSlabs:
             self._runner_bell.ring()
 
     def park(self) -> None:
-        """Ask the runner to ring our doorbell: nobody polls from now on."""
+        """Ask the runner to ring our doorbell, since the server stops polling."""
         self.awake_until = 0
         self._asks[words.PARKED] = 1
 
     @property
     def answered(self) -> bool:
-        """Whether the answer to the last step is there."""
+        """Whether the answer to the last step has arrived."""
         return bool(self._tells[words.SEQUENCE] == self._sequence)
 
     def take(self) -> tuple[Any, list[Buffer]]:
-        """Whom the step was for, and the frames of the answer. Trust: input from the jail.
+        """Returns the step's owner and the frames of the answer. Trust: input from the jail.
 
-        How it went and how long its infos are, these, and the observation slab. What cannot be is
-        the client's to refuse.
+        The frames hold outcome and length of infos, the infos, and the observation slab. The client
+        refuses impossible values.
         """
         owner, self.owner, self.vain = self.owner, None, 0
         head = self._reply[_HEAD_AT : _HEAD_AT + _HEAD.size]
@@ -134,7 +138,7 @@ class ServedSlabs:
         return owner, [first, *(observed[start : start + _CHUNK_BYTES] for start in starts)]
 
     def close(self) -> None:
-        """Give everything back. Idempotent."""
+        """Close all descriptors and views. Idempotent."""
         deposit, self.deposit = self.deposit, []
         close_fds(deposit)
         self._runner_bell.close()
@@ -145,7 +149,7 @@ class ServedSlabs:
 
 
 class ServedSteps:
-    """All steps that runners owe the server, and what takes the answer to each."""
+    """All unanswered steps of the server's runners, with a callback for each."""
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
@@ -153,7 +157,7 @@ class ServedSteps:
         self._owed: dict[ServedSlabs, Callable[[], None]] = {}
 
     def fileno(self) -> int:
-        """Readable when a runner has rung."""
+        """A descriptor that is readable when a runner has rung."""
         return self._epoll.fileno()
 
     def add(self, slabs: ServedSlabs) -> None:
@@ -162,7 +166,7 @@ class ServedSteps:
         self._epoll.register(slabs.bell, select.EPOLLIN | select.EPOLLET)
 
     def forget(self, slabs: ServedSlabs) -> None:
-        """Stop watching its doorbell and close it: the jail has a copy and may go on ringing."""
+        """Stop watching slabs and close them: the jail has a copy and may go on ringing."""
         self._owed.pop(slabs, None)
         self._deafen(slabs)
         slabs.close()
@@ -176,7 +180,9 @@ class ServedSteps:
         self._owed[slabs] = take
 
     def rung(self) -> None:
-        """Take the rings, and stop watching runners that only ring: each ring wakes the server."""
+        """Count rings, and stop watching runners that ring without answering: each ring wakes the
+        server.
+        """
         for fd, _ in self._epoll.poll(0):
             slabs = self._by_bell.get(fd)
             if slabs is not None:
@@ -185,8 +191,8 @@ class ServedSteps:
                     self._deafen(slabs)
 
     def look(self) -> int | None:
-        """Take all answers that are there, and wait a moment for those that come at once.
-        Returns for how many milliseconds the server may sleep; None for as long as it likes.
+        """Take all arrived answers, and poll for a moment for those that come at once.
+        Returns how many milliseconds the server may sleep; None for no limit.
         """
         turn, wait_ms = perf_counter_ns() + _TURN_NS, None
         while self._owed:
@@ -200,7 +206,7 @@ class ServedSteps:
             for slabs in awake:
                 if slabs.awake_until < now:
                     slabs.park()
-                    wait_ms = _RECHECK_MS  # its answer may cross with that: look again soon, once
+                    wait_ms = _RECHECK_MS  # an answer may come before the runner sees this
             if now > turn:
                 return 0
         return wait_ms

@@ -1,7 +1,7 @@
-"""What a jail holds of this machine, and which of its limits it has come to.
+"""Measures a jail's resources, and which of its limits are exhausted.
 
-Counted from outside: by what the kernel and its file system say right now. What is used up is
-denied to the jail from then on, and nothing that the jail says is needed to know it.
+The server measures from outside, by the kernel and the file system, and needs no report from the
+jail. An exhausted limit counts as a denial.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ _LEFT_BYTES = 1 << 16
 
 
 class CountLimit:
-    """Bounds how often is counted: each time takes the server's one thread some milliseconds."""
+    """Limits how often processes are counted: a count takes the server's only thread some
+    milliseconds.
+    """
 
     def __init__(self, now: Callable[[], float] = monotonic) -> None:
         self._now = now
@@ -30,7 +32,7 @@ class CountLimit:
         self._seen = now()
 
     def children(self) -> procfs.Children | None:
-        """The children of each process on this machine; None where it was asked too often."""
+        """Returns the children of each process on this machine; None if asked too often."""
         now = self._now()
         self._left = min(_AT_ONCE, self._left + (now - self._seen) * _A_SECOND)
         self._seen = now
@@ -41,12 +43,12 @@ class CountLimit:
 
 
 def usage_of(init: int, runners: Collection[int], children: procfs.Children) -> dict[str, int]:
-    """Processes, threads and memory of the jail of ``init``; empty where it has gone, or has not
-    begun.
+    """Returns processes, threads and memory of the jail of ``init``; empty before its start and
+    after its end.
 
-    ``processes``: all that live or wait to be reaped, without init. ``threads``: theirs, beyond
-    one each. ``files``: descriptors that the runners have open. ``memory_bytes``: of the runners,
-    what is theirs alone and not a file's.
+    ``processes``: all live and unreaped processes, without init. ``threads``: their threads beyond
+    one each. ``files``: descriptors that the runners have open. ``memory_bytes``: the runners'
+    private memory, without file pages.
     """
     if init <= 0:
         return {}
@@ -70,8 +72,8 @@ def _status(pid: int) -> dict[bytes, int]:
 def reached(
     limits: Limits, usage: Mapping[str, int], runners: Collection[int], *, own_root: bool
 ) -> Iterator[str]:
-    """The names of limits that are used up.
-    ``usage``: of ``usage_of``; ``own_root``: whether its scratch is a file system of its own.
+    """Returns the names of exhausted limits.
+    ``usage``: a result of ``usage_of``; ``own_root``: whether the scratch is its own file system.
     """
     if usage and usage["processes"] + usage["threads"] >= limits.processes:
         yield "PROCESSES"
