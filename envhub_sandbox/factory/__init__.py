@@ -1,1 +1,1 @@
-"""What ``make_env`` does with its arguments, step by step."""
+"""The steps of ``make_env``: from its arguments to vector environments."""

@@ -1,7 +1,7 @@
-"""The entry file of the jail that sources are built in; it is copied there, and imported nowhere.
+"""The entry file of the jail in which sources are built; copied into it, and never imported here.
 
-It calls the build backend, which is a stranger's, in a child process, and gives the wheel back in
-pieces. Nothing of what it answers is believed: ``extras.packages.builds`` checks the wheel.
+It calls the build backend, a stranger's code, in a child process, and returns the wheel in pieces.
+Its answers are not trusted: ``extras.packages.builds`` checks the wheel.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ import gymnasium as gym
 
 TAIL = 16_000
 _SINCE = "315532800"
-"""The time of all files in a wheel, as SOURCE_DATE_EPOCH: the first that a zip can have."""
+"""The time of all files in a wheel (SOURCE_DATE_EPOCH): the earliest that a zip can have."""
 
 
 class Build(gym.Env[Any, Any]):
-    """An environment in name; ``build`` is what it is for."""
+    """An environment in name only, for its method ``build``."""
 
     observation_space = gym.spaces.Discrete(1)
     action_space = gym.spaces.Discrete(1)
     _wheel: Path
 
     def build(self, order: Mapping[str, Any]) -> dict[str, Any]:
-        """Build a wheel, or say what its backend needs besides.
+        """Build a wheel, or return which further packages its backend needs.
         ``order``: ``source``, ``packages``, ``tools``: folders; ``python``: the interpreter;
-        ``backend``, ``backend_path``; ``known``: what the backend is known to need;
+        ``backend``, ``backend_path``; ``known``: the requirements that the backend has already;
         ``environment``: further variables.
         """
         sys.path.insert(0, order["tools"])
@@ -59,21 +59,21 @@ class Build(gym.Env[Any, Any]):
             return {"failed": _tail(folder / "log")}
         except HookMissing as error:
             return {"failed": repr(error)}
-        except Exception as error:  # what the backend raised, or a backend that is not there
+        except Exception as error:  # raised by the backend, or the backend is missing
             return {"failed": f"{_tail(folder / 'log')}\n{type(error).__name__}: {error}"}
         self._wheel = folder / "wheel" / Path(name).name
         mend(self._wheel)
         return {"wheel": self._wheel.name, "size": self._wheel.stat().st_size}
 
     def read(self, start: int, size: int) -> bytes:
-        """A piece of the wheel."""
+        """Return a piece of the wheel."""
         with self._wheel.open("rb") as file:
             file.seek(start)
             return file.read(size)
 
 
 def mend(wheel: Path) -> None:
-    """Write requirements of old metadata such as ``x (>=3.)`` as they are read today."""
+    """Rewrite requirements of old metadata, such as ``x (>=3.)``, in today's form."""
     with zipfile.ZipFile(wheel) as archive:
         files = {member: archive.read(member) for member in archive.infolist()}
     [about] = [member for member in files if member.filename.endswith(".dist-info/METADATA")]
@@ -100,7 +100,7 @@ def _row(member: zipfile.ZipInfo, data: bytes) -> bytes:
 
 
 class _Runner:
-    """Runs the hooks' program in the build environment alone, and keeps what it prints."""
+    """Runs the hooks' program in the build environment alone, and logs its output."""
 
     def __init__(self, log: Path, order: Mapping[str, Any]) -> None:
         self._log = log
@@ -121,7 +121,7 @@ class _Runner:
         cwd: str | None = None,
         extra_environ: Mapping[str, str] | None = None,
     ) -> None:
-        """As ``pyproject_hooks`` calls it."""
+        """Run a command; called by ``pyproject_hooks``."""
         with self._log.open("ab") as log:
             subprocess.run(
                 [self._python, "-S", *cmd[1:]],  # without the packages of the interpreter
@@ -135,7 +135,7 @@ class _Runner:
 
 
 def _copied(source: str, target: str) -> str:
-    """One file with its mode: as old as in every other build."""
+    """Copy a file with its mode, and with a fixed time, so that builds can be repeated."""
     shutil.copyfile(source, target)
     shutil.copymode(source, target)
     os.utime(target, (int(_SINCE), int(_SINCE)))
@@ -149,5 +149,5 @@ def _tail(log: Path) -> str:
 
 
 def make_env(n_envs: int = 1, use_async_envs: bool = False) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """One of them."""
+    """Make the vector environment; called as any repository's ``make_env``."""
     return gym.vector.SyncVectorEnv([Build])

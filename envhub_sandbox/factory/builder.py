@@ -2,8 +2,8 @@
 
 ``extras.packages.builds`` starts it, since packages know no sandboxes. The folder has the sources
 and ``order.json``. The result is printed as JSON: ``wheel``, the name of the file in ``wheel/``;
-``requires``, what the backend needs besides; or ``failed``, the build's output. It ends with the
-process that started it.
+``requires``, further requirements of the backend; or ``failed``, the build's output. This process
+ends with the one that started it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _PIECE = 16 * 2**20
 
 
 def main(folder: Path, ended: int) -> int:
-    """Carry out the order that lies in a folder."""
+    """Carry out the order in a folder, and print the result; returns the exit code."""
     end_with(ended, 10.0)
     order = json.loads((folder / "order.json").read_text())
     os.environ[CACHE_VARIABLE] = str(folder / "cache")  # it goes with the folder
@@ -67,7 +67,7 @@ def _built(folder: Path, order: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _received(env: Any, reply: Mapping[str, Any], target: Path, most: int) -> dict[str, Any]:
-    """The wheel, piece by piece. Trust: input from the worker."""
+    """Receive the wheel piece by piece. Trust: input from the worker."""
     name, size = reply["wheel"], reply["size"]
     if type(name) is not str or type(size) is not int or not 0 < size <= most:
         return {"failed": f"the wheel has not 1 to {most} bytes"}
@@ -107,7 +107,7 @@ def _repository(folder: Path, order: Mapping[str, Any]) -> Repository:
 
 
 def _tools(target: Path) -> Path:
-    """A folder with ``pyproject_hooks``, for the path of an interpreter."""
+    """Copy ``pyproject_hooks`` into a folder for the path of an interpreter."""
     spec = importlib.util.find_spec("pyproject_hooks")
     assert spec is not None
     assert spec.origin is not None

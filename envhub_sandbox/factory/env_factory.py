@@ -1,8 +1,8 @@
 """Makes a caller's environments, from a remembered manifest or from a first jail.
 
-``ManifestCache`` remembers what a pinned repository's ``make_env`` returned, so that the next call
-starts no process. An entry is the worker's own message, is checked again when it is read, and is
-ignored if that fails. The key holds everything that the manifest may depend on.
+``ManifestCache`` remembers the manifest of a pinned repository's ``make_env``, so that the next
+call starts no process. An entry is the worker's own message. It is checked when it is read, and
+ignored if the check fails. The key has everything on which the manifest may depend.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ SharedJails = dict[Launcher, SharedJail]
 
 _FORMAT = 2
 _APART = ".apart"
-"""What the file beside an entry is called that says so."""
+"""The suffix of the file beside an entry that says that sub-environments share state."""
 
 
 class ManifestCache:
-    """One entry of the cache; its ``key`` is None for what must not be remembered."""
+    """One entry of the cache; with the ``key`` None nothing is remembered."""
 
     def __init__(self, folder: Path, key: str | None) -> None:
         self._path = None if key is None else folder / key
 
     def shard_trials(self, lane: str) -> ShardTrials:
-        """What steps of the environments took by this lane, which lies beside the entry."""
+        """The step times of the environments with this lane, in a file beside the entry."""
         if self._path is None:
             return ShardTrials(None)
         path = self._path.with_suffix(f".{lane}-shards")
@@ -65,14 +65,14 @@ class ManifestCache:
 
     def note_shared(self) -> None:
         """Remember that sub-environments need processes of their own, whatever the manifest says.
-        A cache that cannot be written is no error.
+        Failing to write the cache is no error.
         """
         if self._path is not None:
             with contextlib.suppress(OSError):
                 write_whole_file(self._path.with_suffix(_APART), b"")
 
     def load(self, *, max_elements: int) -> Manifest | None:
-        """The remembered manifest, if there is one that can be read."""
+        """The remembered manifest; None if there is none, or if it cannot be read."""
         if self._path is None:
             return None
         try:
@@ -91,7 +91,7 @@ class ManifestCache:
         return None
 
     def save(self, value: dict[str, object]) -> None:
-        """Remember a manifest. A cache that cannot be written is no error."""
+        """Remember a manifest. Failing to write the cache is no error."""
         if self._path is None:
             return
         data = b"".join(map(bytes, pack_packet(1, m.pack(m.LoadDone(value)))))
@@ -107,9 +107,9 @@ class ManifestCache:
 
 
 def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runtime) -> str | None:
-    """The entry's name; None if an argument has no form that can be compared.
+    """The key of a manifest; None if an argument has no form that can be compared.
 
-    Pickles of equal values may differ, such as sets of texts in each process: then it is a miss.
+    Pickles of equal values may differ, as those of a set of texts in two processes: a cache miss.
     """
     try:
         arguments = b"".join(map(bytes, m.pack(load, pickler=partial(pickled, lasting=True))))
@@ -121,7 +121,7 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
         [copy[:3] for copy in snapshot.hub_copies],
         *(policy.profile, policy.network, policy.readable, policy.gpu, policy.environment),
         policy.display,
-        policy.record_denials,  # where it is refused nothing is remembered that says it is not
+        policy.record_denials,  # a host may refuse it, and the cache must not hide that
         *_facts_of(runtime.python or sys.executable, runtime.packages),
     )
     digest = hashlib.sha256(arguments)
@@ -132,9 +132,9 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
 
 @lru_cache(maxsize=8)
 def _code_of(worker: Path) -> str:
-    """A digest of the paths and change times of the worker's modules, which made the manifest.
+    """A digest of the paths and change times of the worker's modules, which make the manifest.
 
-    The folder's own change time does not tell: editing a module in a checkout leaves it as it is.
+    The folder's own change time is not enough: editing a module does not change it.
     """
     files = (Path(folder, name) for folder, _, names in os.walk(worker) for name in names)
     code = [path for path in files if path.suffix == ".py"]
@@ -143,7 +143,7 @@ def _code_of(worker: Path) -> str:
 
 
 def _facts_of(python: str, packages: str) -> tuple[object, ...]:
-    """The interpreter, and when packages were last installed into it."""
+    """The interpreter, and the times when packages were last installed into it."""
     prefix = Path(python).parent.parent
     own = sorted(prefix.glob("lib/python3*/site-packages"))
     folders = [Path(packages)] if packages else own
@@ -161,11 +161,10 @@ class EnvFactory:
     """Makes the proxies, from the remembered manifest or from a first jail.
 
     Args:
-        launchers: Open jails: one for each worker that an environment is spread over, or one
-            alone.
-        num_workers: Over how many processes sub-environments are spread; None for as many as help.
-        prewarm: How many tasks are started ahead; None for what is seen to help.
-        agrees: Raises where the repository is not what was locked.
+        launchers: Open the jails: one launcher for each worker.
+        num_workers: The number of processes for the sub-environments; None for the fastest.
+        prewarm: The number of tasks to start ahead; None to start one once that is seen to help.
+        agrees: Raises if the manifest differs from the lock.
     """
 
     def __init__(
@@ -188,7 +187,7 @@ class EnvFactory:
             repository.warnings.note_shared = self._cache.note_shared
 
     def make(self) -> EnvSuites:
-        """The environments; a first jail is opened where nothing is remembered of them."""
+        """Make the environments, from the remembered manifest or by opening a first jail."""
         repository = self._repository
         manifest = self._cache.load(max_elements=repository.policy.limits.elements)
         if manifest is not None:
@@ -205,7 +204,7 @@ class EnvFactory:
         try:
             self._agrees(loaded.manifest)
             manifest = loaded.manifest
-            # environments live in the jail that describes them, unless each task has its own
+            # environments use the jail that described them, unless each task has its own jail
             is_used = not manifest.lazy or len(manifest.envs) == 1
             if is_used and any(
                 e.shardable and not e.sync and e.num_envs > 1 for e in manifest.envs
@@ -253,7 +252,7 @@ class EnvFactory:
         )
 
     def _shared(self, loaded: LoadedJail | None) -> SharedJails:
-        """A jail for all environments, for each worker."""
+        """One jail for each worker, which all environments share."""
         shared = {
             launcher: SharedJail(launcher, self._cache.forget) for launcher in self._launchers
         }
@@ -293,7 +292,7 @@ class EnvFactory:
         return FleetSession(parts, recorder)
 
     def _use(self, loaded: LoadedJail, sessions: list[AnySession]) -> None:
-        """The jail that gave the manifest becomes the only task's; a suite closes it."""
+        """Give the jail that described the repository to its only task; a suite closes it."""
         if len(sessions) == 1:
             with self._repository.named():
                 sessions[0].prewarms[0].adopt(loaded)
@@ -302,7 +301,7 @@ class EnvFactory:
 
 
 def _each(launcher: Launcher, start: int, stop: int) -> Iterator[tuple[Launcher, tuple[int, int]]]:
-    """One worker for each sub-environment, all in the same place."""
+    """Yield one worker for each sub-environment, all in the same sandbox."""
     for index in range(start, stop):
         yield launcher if index == start else launcher.another(), (index, index + 1)
 

@@ -57,29 +57,29 @@ def make_env(
     """Make the vector environments of a repository, without its code entering this process.
 
     Args:
-        cfg: A hub reference (``"org/repo@commit:path"``), one of git
+        cfg: A hub reference (``"org/repo@commit:path"``), a reference of git
             (``"github:org/repo@commit:path"``), an id that a package registers
             (``"pypi:minigrid@3.0.0#MiniGrid-Empty-5x5-v0"``), a local folder (``"./my-env"``), a
-            ``.py`` file (``"env.py"``: of its folder the code sees what that file imports and what
-            git tracks), or a ``HubEnvConfig``-like object with
+            ``.py`` file (``"env.py"``: its code sees the files that it imports from its folder and
+            those that git tracks), or a ``HubEnvConfig``-like object with
             ``hub_path``, whose ``vars()`` and public properties the repository's ``make_env``
             gets as ``cfg``.
         n_envs: Number of sub-environments, passed to the repository's ``make_env``.
-        use_async_envs: Also passed to it; if True, sub-environments may run in several processes.
+        use_async_envs: Passed, too; if True, sub-environments may run in several processes.
         hub_cache_dir: huggingface_hub's ``cache_dir``.
         trust_remote_code: Needed for ``sandbox=None`` only. If True, environments are as LeRobot's
-            ``make_env`` gives them: a ``reset`` after ``close`` opens one again, and the
+            ``make_env`` makes them: a ``reset`` after ``close`` opens one again, and the
             ``render_fps`` in their metadata is an integer.
         sandbox: Where the code runs: ``"process"``; ``"docker"``, ``"docker:IMAGE"`` or a
             ``DockerSandbox``; ``"ray"`` or a ``RaySandbox``; ``"tcp://HOST:PORT KEY"``, or
-            without the server's public key where that is known, or a ``RemoteSandbox``. A list of
+            without the server's public key if that is known, or a ``RemoteSandbox``. A list of
             these, or a ``Fleet``, spreads the sub-environments of each environment over several
             places (``docs/scaling.md``). None runs the code in this process without protection, as
             LeRobot does.
         env_kwargs: Further keyword arguments for the repository's ``make_env``.
         policy: What the code may reach; see ``Policy``.
         timeouts: How long operations may take; see ``Timeouts``.
-        limits: Hard caps; a mapping overrides those of ``policy.limits`` that it names.
+        limits: Hard caps; a mapping changes those fields of ``policy.limits`` that it names.
         token: As in huggingface_hub.
         endpoint: As in huggingface_hub.
         allow_secrets: Also take a local folder that holds keys or passwords (``.ssh``, ``.env``,
@@ -128,7 +128,7 @@ def make_env(
             (``ServerBusyError``).
         RuntimeError: ``sandbox=None`` without ``trust_remote_code=True``.
     """
-    arguments = locals().copy()  # only these, as long as nothing else has a name here
+    arguments = locals().copy()  # must come first, when only the arguments have names
     return _make(arguments.pop("cfg"), Options(**arguments))
 
 
@@ -137,7 +137,7 @@ def _make(cfg: Any, unchecked: Options) -> EnvSuites:
     options = unchecked.checked()
     if options.sandbox is None:
         return _make_here(reference, config, options)
-    occupy_streams()  # before anything of ours is opened
+    occupy_streams()  # before this opens any file or socket
     plan = _plan(options.sandbox, options)
     snapshot = snapshot_named(reference, **options.source)
     snapshot = with_assets(snapshot, options.assets, options.hub, plan.source.assets)
@@ -153,7 +153,7 @@ def _make(cfg: Any, unchecked: Options) -> EnvSuites:
 
 
 def _suites(snapshot: Snapshot, config: Any, plan: _Plan, options: Options) -> EnvSuites:
-    """The environments of a snapshot. Raises ``DependencyError``."""
+    """Make the environments of a snapshot. Raises ``DependencyError``."""
     target, gpu = plan.sandbox.package_target(), bool(plan.policy.gpu)
     packages = plan.source.packages(snapshot, target, gpu=gpu)
     load = m.Load(
@@ -198,7 +198,7 @@ def _suites(snapshot: Snapshot, config: Any, plan: _Plan, options: Options) -> E
 
 
 def _launchers(repository: Repository, sandbox: Sandbox, options: Options) -> list[Launcher]:
-    """One for each worker with a jail of its own."""
+    """A launcher for each worker with a jail of its own."""
     store, apart = cache_root() / "snapshots", options.min_ready is not None
     count = options.num_workers or (options.n_envs if apart else None)
     launchers = [Launcher(repository, seat, store) for seat in sandbox.workers(count)]
@@ -209,7 +209,7 @@ def _launchers(repository: Repository, sandbox: Sandbox, options: Options) -> li
 
 @dataclass(frozen=True)
 class _Plan:
-    """What the arguments ask for, checked before anything is fetched or started."""
+    """The checked arguments, before anything is fetched or started."""
 
     sandbox: Sandbox
     policy: Policy
@@ -237,7 +237,7 @@ def _plan(sandbox: str | Sandbox, options: Options) -> _Plan:
 
 
 def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
-    """In this process, without a sandbox, as LeRobot does."""
+    """Make the environments in this process, without a sandbox, as LeRobot does."""
     if not options.trust_remote_code:
         raise inprocess.refusal(reference)
     options.refuse_sandboxed()
@@ -248,7 +248,7 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
 
 
 def _ahead(plan: _Plan, options: Options) -> int | None:
-    """How many tasks are started ahead; by default none where that would take what is shared: a
+    """How many tasks to start ahead; by default none if that would use a shared resource: a
     container's memory, a key's quota, a GPU.
     """
     prewarm = plan.policy.prewarm
@@ -261,7 +261,7 @@ def _ahead(plan: _Plan, options: Options) -> int | None:
 
 
 def reference_of(cfg: Any) -> tuple[str, Any]:
-    """The reference in ``cfg``, and the config object if it is one."""
+    """The reference in ``cfg``, and ``cfg`` itself if it is a config object, else None."""
     if isinstance(cfg, str):
         return cfg, None
     if isinstance(cfg, os.PathLike):
@@ -278,9 +278,9 @@ def reference_of(cfg: Any) -> tuple[str, Any]:
 
 
 def sandbox_of(sandbox: str | Sandbox | list[str | Sandbox]) -> Sandbox:
-    """The sandbox of a name, or the one that was given; of a list, a fleet of these.
-    Raises ``PolicyError``: there is none of that name; ``SandboxUnavailableError``: this platform
-    has none of that kind.
+    """The sandbox of a name; a sandbox unchanged; for a list, a fleet of its members.
+    Raises ``PolicyError``: no sandbox has that name; ``SandboxUnavailableError``: this platform or
+    installation lacks it.
     """
     fleet: Any = sandbox
     result: Sandbox
@@ -323,7 +323,7 @@ def _unknown(sandbox: object) -> PolicyError:
 
 
 def interpreter(python: str | Path | None) -> str:
-    """Its path, absolute; a name alone is looked up as a shell does. Empty for ours."""
+    """An interpreter's absolute path; looks up a name as a shell does. Empty for ours."""
     if python is None:
         return ""
     text = os.path.expanduser(python)

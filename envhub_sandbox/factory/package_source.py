@@ -1,4 +1,4 @@
-"""Where a repository's packages come from: of the core, the interpreter that its jails run on.
+"""Where a repository's packages come from: in the core, the interpreter of its jails.
 
 The extra ``extras.packages.source`` makes packages for a repository.
 """
@@ -19,12 +19,12 @@ _EXTRA = "envhub_sandbox.extras.packages.source"
 
 
 class PackageSource:
-    """Makes no packages.
+    """Makes no packages: the repository uses those of the interpreter.
 
     Attributes:
-        python: The interpreter that the caller named.
+        python: The interpreter that the caller named, or None.
         assets: The further repositories that a lock names.
-        always: Whether the repository gets packages of its own, whatever the place has.
+        always: Whether the repository gets its own packages even if the interpreter has them.
     """
 
     assets: Sequence[str] = ()
@@ -34,28 +34,28 @@ class PackageSource:
         self.python = python
 
     def packages(self, snapshot: Snapshot, target: Any, *, gpu: bool) -> Any:
-        """Packages of the repository's own, made for a place; None for those of the place."""
+        """The repository's own packages, made for a target; None to use the interpreter's."""
 
     def advice(self, snapshot: Snapshot, place: str, own: bool, text: str) -> str:
-        """What to do where a module is missing, for the error's text."""
+        """Advice about a missing module, for the error's text."""
         return "Install it into the interpreter that runs the environment"
 
     def note(self, snapshot: Snapshot, target: Any, text: str) -> bool:
-        """Note a module that was missing; whether ``packages`` gives others now."""
+        """Note a missing module; returns whether ``packages`` now returns other packages."""
         return False
 
     def of_its_day(self, snapshot: Snapshot, target: Any, error: EnvHubError) -> str:
-        """What to do about an error that older packages may cure; empty for others."""
+        """Advice about an error that older packages may cure; empty for other errors."""
         return ""
 
     def check(
         self, manifest: Manifest, label: str, env_kwargs: Mapping[str, Any], config: object
     ) -> None:
-        """Raise where a manifest is not what was locked."""
+        """Raise if a manifest differs from the lock."""
 
 
 def source_of(options: Options) -> PackageSource:
-    """The source that arguments of ``make_env`` choose. Raises ``PolicyError``: none is so."""
+    """The source for the arguments of ``make_env``. Raises ``PolicyError``: they are invalid."""
     choice = options.lock, options.sandbox, options.python, options.dependencies
     extra = extras.find(_EXTRA, "RepositoryPackages")
     if extra is None:
