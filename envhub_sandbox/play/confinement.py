@@ -1,7 +1,7 @@
-"""What confined a repository while it was judged, and what it was denied.
+"""Reports what confined a repository while it was checked, and what it was denied.
 
-Denials come from the jail's first process, which the system call filter asks, and not from the
-repository; but it may change a path in its memory while that is read.
+Denials come from the jail's first process, which the system call filter asks, not from the
+repository. But the repository may change a path in its memory while the first process reads it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from envhub_worker.protocol.text import counted, printable
 _MOST, _LONGEST = 40, 300
 _WHOLE = "strict"
 _OF_ALL_PLAIN_USERS = "user-quotas"
-"""A layer that none of them can have: ``envhub doctor`` says so once, and not each run."""
+"""A layer that no user without root can have; ``envhub doctor`` says so, not each run."""
 _NETWORK = "socket AF_"
 _LOCAL = frozenset({"socket AF_UNIX", "socketpair AF_UNIX"})
 _DEEDS = {"connect": "connect to", "sendto": "send to"}
@@ -26,19 +26,19 @@ _HARMLESS = frozenset(
         *("setpriority", "ioprio_set", "io_uring_setup", "socket AF_NETLINK"),
     }
 )
-"""What allocators, pools of threads and the C library try on their way, and do without."""
+"""System calls that allocators, thread pools and the C library try, and can do without."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Confinement:
-    """The confinement of one judgement.
+    """The confinement during one check.
 
     Attributes:
-        asked: The profile that the caller named, or the default: no other is taken for it.
-        profile: The one that its jails had; empty where it did not load.
-        held: How many layers held.
-        missing: Layers that did not hold, by name, and why.
-        unrecorded: Why what it tried was not recorded; empty where it was.
+        asked: The profile that the caller named, or the default one.
+        profile: The profile of the jails; empty if the repository did not load.
+        held: The number of layers that were enforced.
+        missing: The layers that were not enforced, by name, and why.
+        unrecorded: Why denials were not recorded; empty if they were.
     """
 
     asked: str
@@ -49,7 +49,7 @@ class Confinement:
 
     @classmethod
     def of(cls, asked: str, provenance: Mapping[str, Any] | None, unrecorded: str) -> Confinement:
-        """Of what ran. Trust: a server on another host may have said which layers hold."""
+        """Read a provenance. Trust: a server on another host may claim any layers."""
         ran = provenance or {}
         layers = ran.get("layers") or ()
         lacks = [layer for layer in layers if layer.get("enforced") is not True][:_MOST]
@@ -65,11 +65,11 @@ class Confinement:
 
     @property
     def is_partial(self) -> bool:
-        """Whether a person should know that there was less than there can be."""
+        """Whether to tell people that the confinement or its record was not complete."""
         return (self.profile or self.asked) != _WHOLE or bool(self.unrecorded)
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """In the words of ``envhub run``: what is said, and about what."""
+        """Yield pairs of title and text, as ``envhub run`` prints them."""
         if not self.profile:
             yield "confined by", f"{self.asked}; it did not load"
         else:
@@ -83,11 +83,11 @@ class Confinement:
             yield "not recorded", f"denied attempts: {self.unrecorded}"
 
     def lines(self) -> Iterator[str]:
-        """The same, one line each."""
+        """Yield the rows as lines of text."""
         yield from (f"{title}: {text}" for title, text in self.rows())
 
     def document(self) -> dict[str, Any]:
-        """As plain data."""
+        """The confinement as plain data."""
         return {
             "asked": self.asked,
             "profile": self.profile or None,
@@ -102,7 +102,7 @@ def _line(text: object) -> str:
 
 
 def denial_findings(denied: Iterable[str]) -> dict[str, list[str]]:
-    """The findings of each check, of what was denied. Trust: paths are a stranger's words."""
+    """Turn denials into findings, by check. Trust: a stranger chose the paths."""
     checks = ("denied-network", "denied-files", "denied-kernel", "limits-reached")
     findings: dict[str, list[str]] = {check: [] for check in checks}
     for denial in sorted(set(denied) - _HARMLESS):

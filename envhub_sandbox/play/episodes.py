@@ -1,4 +1,4 @@
-"""Plays episodes in a vector environment, and counts them right whatever its autoreset mode.
+"""Plays episodes in a vector environment, and counts them correctly in every autoreset mode.
 
 Each sub-environment has a fixed quota of episodes. Taking the first N that finish anywhere would
 favour short ones.
@@ -22,7 +22,7 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_worker.protocol.manifest.manifest import AUTORESET_MODES
 
 MAX_COMPONENTS = 64
-"""Components of a vector reward: more cannot be reported one by one."""
+"""The most components of a vector reward that are reported one by one."""
 _FINAL_KEYS = ("final_obs", "final_observation", "final_info")
 
 Bools = NDArray[np.bool_]
@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 
 class RolloutError(EnvHubError):
-    """The environment answered in a way that no episode can be counted with."""
+    """The environment's results cannot be counted as episodes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +39,8 @@ class Episode:
 
     Attributes:
         sub_env: Index of the sub-environment that played it.
-        returns: The sum of rewards, one per component; just one unless rewards are vectors.
-        terminated: It terminated; otherwise it was truncated.
+        returns: The sum of rewards, for each component of the reward; one if it is a number.
+        terminated: Whether it terminated; otherwise it was truncated.
         success: ``is_success`` of the last step's info, if there was one.
     """
 
@@ -53,13 +53,13 @@ class Episode:
 
 @dataclass
 class Rollout:
-    """What a rollout gave.
+    """The results of a rollout.
 
     Attributes:
-        episodes: Finished and within the quota, in the order in which they ended.
-        steps: Of all sub-environments together; resets are no steps.
+        episodes: The finished episodes within the quota, in the order in which they ended.
+        steps: The steps of all sub-environments; resets do not count.
         first_step_s: Seconds from the call of ``reset`` to the first step's result.
-        complete: Every quota was met.
+        complete: Whether every quota was met.
     """
 
     episodes: list[Episode] = field(default_factory=list)
@@ -75,23 +75,23 @@ class Rollout:
 
 
 def quotas(num_envs: int, episodes: int) -> list[int]:
-    """Episodes of each sub-environment: even, the first ones take the rest."""
+    """The number of episodes of each sub-environment: even, and the first ones play the rest."""
     return [(episodes + num_envs - 1 - index) // num_envs for index in range(num_envs)]
 
 
 def autoreset_mode(env: VectorEnv[Any, Any, Any]) -> str | None:
-    """``"NextStep"``, ``"SameStep"``, ``"Disabled"``, or None where the metadata does not say."""
+    """``"NextStep"``, ``"SameStep"``, ``"Disabled"``, or None if the metadata does not say."""
     mode = (env.metadata or {}).get("autoreset_mode")
     mode = getattr(mode, "value", mode)
     return mode if mode in AUTORESET_MODES else None
 
 
 class EpisodeCounter:
-    """Turns the results of vector steps into episodes. Steps nothing itself.
+    """Counts episodes from the results of vector steps, which the caller makes.
 
-    Where the metadata does not state the autoreset mode, the first step that ends an episode
-    shows: infos with the final observation mean SAME_STEP, otherwise NEXT_STEP is assumed, which
-    is what Gymnasium's own wrappers assume.
+    If the metadata does not state the autoreset mode, the first step that ends an episode shows it:
+    infos with the final observation mean SAME_STEP; otherwise NEXT_STEP is assumed, as Gymnasium's
+    own wrappers do.
 
     Attributes:
         counted: Finished episodes within the quota.
@@ -190,7 +190,7 @@ class EpisodeCounter:
 def success_of(infos: Any, index: int) -> bool | None:
     """``is_success`` of one sub-environment, from the final infos if there are any.
 
-    Trust: infos are input from the worker; what has an unexpected form counts as not stated.
+    Trust: infos are input from the worker; a value of an unexpected form counts as not stated.
     """
     if not isinstance(infos, Mapping):
         return None
@@ -214,7 +214,7 @@ def _success_in(infos: Any, index: int) -> Any:
 
 
 def on_cpu(value: Any) -> Any:
-    """A tensor as an array; everything else as it is."""
+    """A tensor as an array; any other value unchanged."""
     is_tensor = hasattr(value, "tolist") and hasattr(value, "cpu")
     return value.cpu().numpy() if is_tensor else value
 
@@ -228,13 +228,13 @@ def rollout(
     max_steps: int | None = None,
     observe: Callable[[EpisodeCounter], None] = lambda counter: None,
 ) -> Rollout:
-    """Play until every sub-environment has met its quota, which makes ``episodes`` in all.
+    """Play until every sub-environment has met its quota, ``episodes`` in total.
 
     Args:
-        env: Is left open.
+        env: The environment, which stays open.
         seed: For ``reset`` and the actions: the same seed gives the same result.
-        actions: ``"random"`` samples from the space, seeded; ``"zero"`` does as little as the space
-            allows.
+        actions: ``"random"`` samples from the seeded space; ``"zero"`` is as near to zero as the
+            space allows.
         max_steps: Vector steps after which to give up; None for no bound.
         observe: Called after the reset and after every step.
     Raises ``RolloutError``: the environment's answers cannot be counted, or its space is unknown.
@@ -275,8 +275,8 @@ def _step(
 
 
 def zero_action(space: gym.Space[Any]) -> Any:
-    """A member of ``space`` that is zero, or as near to it as the space allows.
-    Raises ``gymnasium.error.CustomSpaceError``: the space is none of Gymnasium's.
+    """A member of ``space`` that is zero, or as near to zero as the space allows.
+    Raises ``gymnasium.error.CustomSpaceError``: the space is not of a class of Gymnasium.
     """
     match space:
         case spaces.Box():

@@ -1,6 +1,6 @@
-"""What a play gave that people look at: numbers to plot, pictures, and videos by imageio's ffmpeg.
+"""The results of a play for people: numbers to plot, pictures, and videos by imageio's ffmpeg.
 
-No check asks for it. Frames come from the worker, so they are judged before they go to an encoder.
+No check depends on them. Frames come from the worker, so they are checked before they are encoded.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ _FRAMES = 75
 _SECONDS = 1.5
 _FPS = 25.0
 _LASTS = 3.0
-"""Seconds, where there are so few frames that at their own rate a film were over at once."""
+"""The least seconds of a film: with few frames, their rate is lowered."""
 _STILLS = 4
 MAX_SIDE = 4096
-"""Pixels: H.264 encoders stop there, and a frame stays below 50 MB."""
+"""The most pixels of a side: the limit of H.264 encoders, so that a frame has less than 50 MB."""
 DEFAULT_FPS = 30.0
 MIN_FPS = 0.1
-"""Below, the times of frames are more than some containers can write."""
+"""Below this rate some video containers cannot write the times of frames."""
 MAX_FPS = 240.0
 SUFFIXES = (".mp4", ".mkv", ".mov")
 
 
 def check_target(path: Path) -> None:
-    """Refuse a target that cannot work, before anything is run. Raises ``VideoError``."""
+    """Raise ``VideoError`` if a target cannot be written, before anything runs."""
     if not can_encode():
         raise VideoError(
             "writing a video needs imageio's ffmpeg, which is not installed; install it with: pip "
@@ -58,13 +58,13 @@ def check_target(path: Path) -> None:
 
 
 def can_encode() -> bool:
-    """Whether what writes videos is installed."""
+    """Whether the package that writes videos is installed."""
     return importlib.util.find_spec("imageio_ffmpeg") is not None
 
 
 def encoded(frames: Sequence[Frame], fps: float) -> bytes:
-    """The bytes of an MP4 with H.264, of frames of one size as ``first_frame`` gives them.
-    Raises ``VideoError``: it cannot be written.
+    """Encode frames of one size, as ``first_frame`` returns them, as MP4 with H.264.
+    Raises ``VideoError``: the video cannot be written.
     """
     try:
         with TemporaryDirectory(prefix="envhub-film-") as folder:
@@ -80,14 +80,14 @@ def encoded(frames: Sequence[Frame], fps: float) -> bytes:
 def fps_of(metadata: Any) -> float:
     """``render_fps`` of an environment's metadata if it is a sensible number, else 30."""
     fps = metadata.get("render_fps") if isinstance(metadata, dict) else None
-    # compared first: an integer from the wire may be too large for a float
+    # compared before float(): an integer from the worker may be too large for a float
     if isinstance(fps, (int, float)) and MIN_FPS <= fps <= MAX_FPS:
         return float(fps)
     return DEFAULT_FPS
 
 
 def frame_of(env: Any) -> Frame:
-    """What the first sub-environment renders; raises as ``first_frame`` does."""
+    """Render, and return the first sub-environment's frame; raises as ``first_frame`` does."""
     try:
         rendered = env.render()
     except RemoteEnvError as error:
@@ -98,7 +98,7 @@ def frame_of(env: Any) -> Frame:
 
 def first_frame(rendered: Any, render_mode: str | None) -> Frame:
     """The first sub-environment's frame: uint8 ``(height, width, 3)``, both sides even.
-    Raises ``VideoError``: there is no such frame. Trust: input from the worker.
+    Raises ``VideoError``: this is not such a frame. Trust: input from the worker.
     """
     frame = rendered
     batched = isinstance(rendered, (tuple, list)) or getattr(rendered, "ndim", 0) == 4
@@ -129,8 +129,8 @@ def _advice(render_mode: str | None) -> str:
 
 @contextlib.contextmanager
 def video_writer(path: Path, fps: float) -> Iterator[Callable[[Frame], None]]:
-    """Write a video that can be played afterwards; gives a function that appends a frame as
-    ``first_frame`` makes it, or raises ``VideoError``.
+    """Write a video, complete at the end of this context; yields a function that appends a frame of
+    ``first_frame``, or raises ``VideoError``.
     """
     import imageio_ffmpeg  # type: ignore[import-untyped]
 
@@ -143,7 +143,7 @@ def video_writer(path: Path, fps: float) -> Iterator[Callable[[Frame], None]]:
         try:
             if encoder is None:
                 size = frame_size
-                # absolute, so that ffmpeg can take no name for an option or a protocol
+                # absolute, so that ffmpeg takes no file name for an option or a protocol
                 encoder = imageio_ffmpeg.write_frames(
                     os.path.abspath(path),
                     size,
@@ -170,21 +170,21 @@ def video_writer(path: Path, fps: float) -> Iterator[Callable[[Frame], None]]:
 
 
 def even(frame: Frame) -> Frame:
-    """A frame with even sides, as encoders need them: an odd one repeats its last row or column."""
+    """Make both sides of a frame even, as encoders need, by repeating its last row or column."""
     height, width, _ = frame.shape
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
 
 @dataclass(frozen=True)
 class Film:
-    """The first steps of a play, small, encoded here of frames that were judged.
+    """The first steps of a play as small pictures and a video, encoded from checked frames.
 
     Attributes:
-        stills: PNG, the first and the last frame and some between.
-        video: MP4 with H.264; empty where there is none.
-        frames: How many were rendered.
-        fps: How many of them the video shows in a second.
-        lacks: Why there is no video, or no picture at all.
+        stills: The first and the last frame and some between, as PNG.
+        video: The video, MP4 with H.264; empty if there is none.
+        frames: The number of rendered frames.
+        fps: The frames per second of the video.
+        lacks: Why the video or all pictures are missing.
     """
 
     stills: tuple[bytes, ...] = ()
@@ -196,15 +196,15 @@ class Film:
 
 @dataclass
 class Play:
-    """What is shown of one task.
+    """The data about one task that a report shows.
 
     Attributes:
-        facts: Its spaces and what else it says of itself, by name. Trust: the worker's words.
-        episodes: Those that ended in the first play.
-        step_s: Seconds of each step of the second play, which is not observed.
-        memory: Bytes that its jail held, from outside: while it was played, and then after each
-            round of resets; ``played`` says how many are of the play.
-        film: None where none was asked for, or it says that it renders nothing.
+        facts: Its spaces and its other facts, by name. Trust: values from the worker.
+        episodes: The episodes that ended in the first play.
+        step_s: The seconds of each step of the second play, which is not observed.
+        memory: The bytes of its jail, measured from outside: during the play, and then after each
+            round of resets; ``played`` is the number of values from the play.
+        film: The film, or None if none was wanted or the environment renders nothing.
     """
 
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -222,7 +222,7 @@ class Play:
 
 
 def facts_of(env: VectorEnv[Any, Any, Any]) -> dict[str, str]:
-    """What an environment says of itself, printable and bounded."""
+    """The facts that an environment states about itself, printable and bounded."""
     mode = (env.metadata or {}).get("autoreset_mode")
     facts = {
         "observations": env.single_observation_space,
@@ -235,7 +235,7 @@ def facts_of(env: VectorEnv[Any, Any, Any]) -> dict[str, str]:
 
 
 def film(env: VectorEnv[Any, Any, Any], *, seed: int, seconds: float = _SECONDS) -> Film:
-    """Play again and render, bounded in frames and in time; the film says what failed."""
+    """Play again and render, bounded in frames and time; a failure is in ``Film.lacks``."""
     frames: list[Frame] = []
     lacks = ""
     try:
@@ -251,7 +251,7 @@ def film(env: VectorEnv[Any, Any, Any], *, seed: int, seconds: float = _SECONDS)
         return Film(stills, frames=len(frames), lacks=lacks or ask)
     try:
         return Film(stills, encoded(frames, fps), len(frames), fps, lacks)
-    except EnvHubError as error:  # such as frames of another size each time
+    except EnvHubError as error:  # for instance because the size of frames changes
         return Film(stills, frames=len(frames), lacks=printable(str(error), 300))
 
 
