@@ -1,1 +1,1 @@
-"""What a caller may set: every option of ``make_env``, and what a policy permits."""
+"""The settings of a caller: every option of ``make_env``, and policies."""

@@ -1,11 +1,11 @@
-"""Every option of ``make_env``, once: type, default, check, help, and its name for commands.
+"""The table of all options of ``make_env``: type, default, check, help, and name for commands.
 
 The parameters of ``envhub`` and the fields of LeRobot's configuration are made from this table.
 ``make_env`` has names and defaults in its signature too, for editors and readers;
 a test compares the two.
 
-An error names an option by its key (``option_name``). What reads a command line calls
-``use_option_names``, so that errors use the words of that command line.
+An error names an option by its key (``option_name``). A command line calls ``use_option_names``, so
+that errors write options as that command line does.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ class Option:
     """One option.
 
     Attributes:
-        command: Its names for the commands of ``envhub`` that have it; empty if none has.
-        help: What the help of a command says of it.
-        metavar: How the help writes a value; a shell completes its small letters.
+        command: Its names for commands of ``envhub``; empty if no command has it.
+        help: Its text in the help of a command.
+        metavar: How the help writes a value; a shell completes the parts in lower case.
         kind: The type of its value on a command line; ``list`` is of texts, ``dict`` is JSON.
         least, most: The bounds of a number.
-        check: Called with its value; returns the form that the rest relies on, or raises.
-        panel: The heading that it stands under in a help.
-        sandboxed: Whether it means nothing without a sandbox.
-        travels: Whether a pickle of the environments holds it: trust and secrets are not handed on,
-            and limits are part of the policy.
+        check: Called with a value; returns its normal form, or raises.
+        panel: Its heading in the help.
+        sandboxed: Whether it has no meaning without a sandbox.
+        travels: Whether a pickle of the environments contains it. Trust and secrets are not passed
+            on, and limits are part of the policy.
         argument: The argument of ``make_env``.
-        field: Its key, where that argument is a mapping.
-        default: What holds where it is not given.
+        field: Its key, if that argument is a mapping.
+        default: Its value if the caller does not set it.
     """
 
     command: str = ""
@@ -70,20 +70,20 @@ class Option:
 
     @property
     def parameter(self) -> str:
-        """What the parameter of a command is called."""
+        """The name of a command's parameter for it."""
         name = self.command.split()[0].lstrip("-").replace("-", "_")
         return self.argument if iskeyword(name) else name
 
     def checked(self, value: Any) -> Any:
-        """The form of a value that the rest relies on. Raises ``TypeError``, ``ValueError`` or
-        ``PolicyError``: nothing can be made of it.
+        """Check a value and return its normal form. Raises ``TypeError``, ``ValueError`` or
+        ``PolicyError`` for an invalid value.
         """
         if self.check is not None:
             return self.check(value)
         return value if self.least is None else self._whole(value)
 
     def _whole(self, value: Any) -> int | None:
-        """A number of Python or numpy; None where that is the default."""
+        """A whole number of Python or numpy as an ``int``; None if that is the default."""
         if value is None and self.default is None:
             return None
         try:
@@ -99,7 +99,7 @@ class Option:
 
 
 def _flag(value: Any) -> bool:
-    import numpy as np  # which a help must not cost
+    import numpy as np  # late, so that a help does not wait for it
 
     if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"`use_async_envs` is {value!r}; it is True or False")
@@ -131,7 +131,7 @@ def _option(default: Any, command: str = "", text: str = "", **attributes: Any) 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Options:
-    """What ``make_env`` takes beside its reference; its docstring explains each."""
+    """The arguments of ``make_env`` beside its reference; its docstring explains each."""
 
     n_envs: int = _option(
         1, "--n-envs -n", "Sub-environments.", kind=int, least=1, most=MAX_NUM_ENVS
@@ -240,21 +240,21 @@ class Options:
 
     @property
     def source(self) -> dict[str, Any]:
-        """Where a reference is looked for, and how."""
+        """The arguments of ``snapshot_named`` for the reference."""
         return {**self.hub, "allow_secrets": self.allow_secrets}
 
     @property
     def hub(self) -> dict[str, Any]:
-        """Which Hub, and how."""
+        """The arguments that choose the Hub, its login and its cache."""
         return {key: getattr(self, key) for key in ("token", "endpoint", "hub_cache_dir")}
 
     def checked(self) -> Options:
-        """The same, where each has the form that the rest relies on."""
+        """Check all options; returns their normal forms."""
         values = vars(self).items()
         return Options(**{name: OPTIONS[name].checked(value) for name, value in values})
 
     def refuse_sandboxed(self) -> None:
-        """Without a sandbox: refuse what would silently do nothing, by name."""
+        """Raise ``PolicyError`` for options that would do nothing without a sandbox."""
         values = {name: value for name, value in vars(self).items() if OPTIONS[name].sandboxed}
         idle = [name for name, value in values.items() if value and value != OPTIONS[name].default]
         if idle:
@@ -263,7 +263,7 @@ class Options:
             )
 
     def for_a_recipe(self, **changes: Any) -> dict[str, Any]:
-        """Those that make the same environments elsewhere."""
+        """The options that make the same environments in another process."""
         lock = None if self.lock is None else os.path.abspath(self.lock)
         kept = {name: value for name, value in vars(self).items() if OPTIONS[name].travels}
         return {**kept, "lock": lock, **changes}
@@ -318,14 +318,14 @@ _KEYS: dict[str, dict[str, Option]] = {
     },
     "timeouts": dict.fromkeys(("startup_s", "reset_s", "step_s", "call_s"), _TIMEOUT),
 }
-"""By the argument that is a mapping: those of its keys that commands have."""
+"""For each argument that is a mapping, the keys that commands have."""
 _IN_PYTHON = {
     "policy": "restart restart_budget restart_backoff_s record_denials crash_history crash_folder "
     "prewarm lane",
     "limits": "open_files disk_files file_bytes output_bytes message_bytes elements",
     "timeouts": "close_s idle_s server_idle_s",
 }
-"""The other keys."""
+"""For each argument that is a mapping, the keys that only Python has."""
 
 
 def _table() -> dict[str, Option]:
@@ -345,23 +345,23 @@ def _table() -> dict[str, Option]:
 
 
 OPTIONS = _table()
-"""By key: every argument of ``make_env``, and every key of those that are mappings."""
+"""Every argument of ``make_env``, and every key of its mappings, by name."""
 
 Spelling = Callable[[Option, Any], str]
-"""How an option, with a value, is written where the user is."""
+"""Writes an option with a value, as in Python or on a command line."""
 _NO_VALUE = object()
 
 
 def in_python(option: Option, value: Any) -> str:
-    """``dependencies='host'``, ``policy={'profile': 'no-userns'}``."""
+    """Write ``dependencies='host'``, ``policy={'profile': 'no-userns'}``."""
     if value is _NO_VALUE:
         return f"{option.argument}: {option.field}" if option.field else option.argument
     return f"{option.argument}={ {option.field: value} if option.field else value!r}"
 
 
 def on_command_line(available: Collection[str]) -> Spelling:
-    """``--dependencies host``, ``--profile no-userns``, an option again for each of a list; in
-    Python what is not ``known`` to the command.
+    """Write ``--dependencies host``, ``--profile no-userns``, and an option for each of a list;
+    options that the command lacks are written as in Python.
     """
 
     def spelling(option: Option, value: Any) -> str:
@@ -377,7 +377,7 @@ def on_command_line(available: Collection[str]) -> Spelling:
 
 
 def on_lerobots_command_line(prefix: str = "--env.") -> Spelling:
-    """``--env.dependencies=host``, ``--env.policy='{"profile": "no-userns"}'``."""
+    """Write ``--env.dependencies=host``, ``--env.policy='{"profile": "no-userns"}'``."""
 
     def spelling(option: Option, value: Any) -> str:
         if value is _NO_VALUE:
@@ -389,7 +389,7 @@ def on_lerobots_command_line(prefix: str = "--env.") -> Spelling:
 
 
 def json_or_text(text: str) -> Any:
-    """A value that was typed as JSON, or else is a text."""
+    """The value of a text that is JSON, else the text itself."""
     try:
         return json.loads(text)
     except ValueError:
@@ -404,12 +404,12 @@ _spelling: Spelling = in_python
 
 
 def option_name(key: str, value: Any = _NO_VALUE) -> str:
-    """An option, with a value to give to it, as it is written where the user is."""
+    """An option with a value, written as the user writes it: in Python or on a command line."""
     return _spelling(OPTIONS[key], value)
 
 
 def nearest(name: object, names: Iterable[str], cutoff: float = 0.6) -> str:
-    """A question in brackets about the known name that is most like another; empty for none."""
+    """A question in brackets that suggests the most similar known name; empty if there is none."""
     import difflib
 
     close = difflib.get_close_matches(str(name), list(names), 1, cutoff)
@@ -417,7 +417,7 @@ def nearest(name: object, names: Iterable[str], cutoff: float = 0.6) -> str:
 
 
 def refuse_unknown_arguments(make: Callable[P, T]) -> Callable[P, T]:
-    """Decorate ``make_env``: a ``TypeError`` says where an argument that it lacks belongs."""
+    """Decorate ``make_env``, so that a ``TypeError`` says where an unknown argument belongs."""
     arguments = inspect.signature(make).parameters
 
     @functools.wraps(make)
@@ -441,7 +441,7 @@ def _place_of(name: str) -> str:
 
 @contextlib.contextmanager
 def use_option_names(spelling: Spelling) -> Iterator[None]:
-    """Write options in this way while it lasts. One place for all threads of a process."""
+    """Within this context, write options by ``spelling``, in all threads of this process."""
     global _spelling
     before, _spelling = _spelling, spelling
     try:

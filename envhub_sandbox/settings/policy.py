@@ -1,7 +1,7 @@
-"""What a jail is permitted, how much, and how long one waits. Frozen, keyword-only values.
+"""Policies, limits and timeouts of jails, as frozen, keyword-only dataclasses.
 
 Unknown names and impossible values are refused with ``PolicyError``: a misspelt limit that
-silently did nothing would be a hole.
+silently did nothing would be a security hole.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ class Policy:
                 f"{option_name('record_denials')} is {self.record_denials!r}; it takes True or "
                 "False"
             )
-        # frozen: this is how a field gets the form that the rest relies on
+        # the dataclass is frozen, so this sets a field to its normal form
         object.__setattr__(self, "readable", _texts("readable", self.readable))
         object.__setattr__(self, "environment", _texts("environment", self.environment))
         for name in self.environment:
@@ -159,7 +159,7 @@ class Policy:
                 )
 
     def confinement(self) -> Confinement:
-        """What travels to the worker; the named environment variables get their values here.
+        """The part of the policy for the worker, with the values of the named variables.
 
         Raises:
             PolicyError: A variable with this value cannot be granted.
@@ -186,13 +186,13 @@ T = TypeVar("T", Policy, Limits, Timeouts)
 def policy_from(
     value: Policy | Mapping[str, Any] | None, limits: Limits | Mapping[str, Any] | None
 ) -> Policy:
-    """A policy from what ``make_env`` was given.
+    """Make a policy from the arguments of ``make_env``.
 
-    A mapping of ``limits`` changes those that it names. An object has all of them, which is
-    ambiguous beside limits of the policy's own.
+    A mapping of ``limits`` changes the limits that it names. A ``Limits`` object has all limits,
+    which is ambiguous if the policy has limits of its own.
 
     Raises:
-        PolicyError: It is no policy, or the limits are said twice.
+        PolicyError: The policy is invalid, or the limits are ambiguous.
     """
     policy = _from(Policy, value, "policy")
     chosen = limits_from(limits)
@@ -210,12 +210,12 @@ def policy_from(
 
 
 def limits_from(value: Limits | Mapping[str, Any] | None) -> Limits | None:
-    """Limits from what ``make_env`` was given."""
+    """Make limits from the argument of ``make_env``."""
     return None if value is None else _from(Limits, value, "limits")
 
 
 def timeouts_from(value: Timeouts | Mapping[str, Any] | None) -> Timeouts:
-    """Timeouts from what ``make_env`` was given."""
+    """Make timeouts from the argument of ``make_env``."""
     return _from(Timeouts, value, "timeouts")
 
 
@@ -290,7 +290,7 @@ def _texts(name: str, value: object) -> tuple[str, ...]:
 
 
 def _members(value: object) -> tuple[Any, ...] | None:
-    """Those of any sequence, such as a list of a configuration of Hydra's; a text is none here."""
+    """The members of any sequence, such as a list of a Hydra configuration; None for a text."""
     is_list = isinstance(value, Sequence) and not isinstance(value, (str, bytes))
     return tuple(value) if is_list else None  # type: ignore[arg-type]
 
