@@ -1,1 +1,1 @@
-"""Other libraries' faces of a sandboxed environment, one module a library; each imports its own."""
+"""Sandboxed environments with other libraries' interfaces, one module for each library."""

@@ -5,7 +5,7 @@
     >>> env = gymnasium.make(name, ref="org/repo@<commit>")
     >>> envs = gymnasium.make_vec(name, num_envs=4, ref="org/repo@<commit>")
 
-What stands before the colon is imported by Gymnasium, which finds the id registered then.
+Gymnasium imports the module before the colon, which registers the id.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class SandboxEnv(SingleEnv, gymnasium.Env[Any, Any]):
 
 @short_traceback
 def make_again(ref: Any, *, render_mode: str | None = None, **options: Any) -> SandboxEnv:
-    """What ``gymnasium.make(env.spec)`` calls.
+    """Make an environment again from its spec; ``gymnasium.make(env.spec)`` calls it.
 
     As ``SandboxEnv``, but where the repository's ``make_env`` takes no ``render_mode``: then the
     environment has the one that the repository gives it, and another is told by a warning.
@@ -89,7 +89,7 @@ def make_vector(
     max_episode_steps: int | None = None,
     **options: Any,
 ) -> VectorEnv[Any, Any, Any]:
-    """What ``gymnasium.make_vec`` calls: the vector environment of a repository.
+    """Make a repository's vector environment; ``gymnasium.make_vec`` calls it.
 
     Args:
         ref: What ``envhub_sandbox.make_env`` takes.

@@ -50,7 +50,7 @@ _COUNTERS = (
 
 
 class EnvHubCollector(Collector):
-    """Gives the numbers of all environments; ``register`` one with a registry."""
+    """Collects the numbers of all environments; ``register`` it with a registry."""
 
     def collect(self) -> Iterator[Metric]:
         """The metrics, one family each."""

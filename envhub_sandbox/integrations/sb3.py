@@ -212,7 +212,7 @@ class SandboxVecEnv(VecEnv):
         ]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: _Indices = None) -> list[bool]:
-        """False for each: what is wrapped in the sandbox is not this process's class."""
+        """False for each: wrappers in the sandbox are not classes of this process."""
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:

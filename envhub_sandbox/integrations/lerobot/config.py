@@ -59,7 +59,7 @@ class SpareSuites:
         self._kept: dict[Hashable, EnvSuites] = {}
 
     def put(self, key: Hashable, suites: EnvSuites) -> None:
-        """Keep these; others of that key are closed."""
+        """Keep environments under a key; close those that had the key before."""
         with self._lock:
             before, self._kept[key] = self._kept.get(key), suites
         if before is not None:
@@ -69,7 +69,7 @@ class SpareSuites:
         timer.start()
 
     def take(self, key: Hashable) -> EnvSuites | None:
-        """Those of this key, which are the caller's from now on."""
+        """Remove and return the environments of a key; the caller has to close them."""
         with self._lock:
             return self._kept.pop(key, None)
 
@@ -83,12 +83,12 @@ class SpareSuites:
 
 _SPARES = SpareSuites()
 _LONGEST = 200
-"""Characters of the repository's names in a text."""
+"""The most characters of the repository's names in a text."""
 _NO_REPO = "env.repo is missing: which repository? --env.repo=org/repo@<commit>"
 
 
 def _with_options(config: type[Any]) -> type[Any]:
-    """A field for each option, of the type that it has on a command line."""
+    """Decorate a configuration: add a field for each option, of its command line type."""
     for key, option in _OPTIONS.items():
         if option.kind is dict:
             config.__annotations__[key] = dict[str, Any]
@@ -163,7 +163,7 @@ class SandboxedEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Nothing: Gymnasium's registry makes none of these."""
+        """Empty, since Gymnasium's registry does not make these environments."""
         return {}
 
     @property
@@ -192,7 +192,7 @@ class SandboxedEnvConfig(EnvConfig):
         return self._made(n_envs, use_async_envs) if spare is None else spare
 
     def _options(self) -> dict[str, Any]:
-        """``make_env``'s, as the fields say them."""
+        """The options of ``make_env`` from the fields."""
         values = {key: getattr(self, key) for key in _OPTIONS}
         values |= {key: values[key] or None for key in _OPTIONS if _OPTIONS[key].kind is dict}
         if isinstance(values["dependencies"], str) and values["dependencies"].startswith("{"):
@@ -234,7 +234,7 @@ class SandboxedEnvConfig(EnvConfig):
             self.fps = fps
 
     def _merge(self, features: dict[str, PolicyFeature], names: dict[str, str]) -> None:
-        """What was given goes before what the spaces say."""
+        """Merge features of the spaces with the user's, which have precedence."""
         self.features = {**features, **self.features}
         self.features_map = {**names, **self.features_map}
         for key in self.features.keys() ^ self.features_map.keys():

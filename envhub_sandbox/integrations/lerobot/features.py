@@ -1,4 +1,4 @@
-"""What of an environment's observations LeRobot's policies see: processors, and features.
+"""Chooses LeRobot's processor steps for an environment, and the features that its policies see.
 
 Followed: ``preprocess_observation`` of ``lerobot.envs.utils``, which decides what is passed on, and
 under which name, and the steps of ``lerobot.processor.env_processor`` that may follow it.
@@ -19,7 +19,7 @@ from lerobot.processor.pipeline import ProcessorStepRegistry
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES, OBS_STATE, OBS_STR
 
 DECLARED = "env_preprocessor"
-"""The key of an environment's metadata under which a repository names processor steps."""
+"""The key in an environment's metadata by which a repository names processor steps."""
 LIBERO, ARENA = "libero_processor", "isaaclab_arena_processor"
 RENAME = "rename_observations_processor"
 _FIELDS: dict[str, dict[str, type[Any]]] = {
@@ -38,7 +38,7 @@ _LIBERO_SIZE = 8
 
 
 class Feature(NamedTuple):
-    """What a policy sees: its name there, and what it is.
+    """A feature for a policy: its name in LeRobot, and its type.
     ``source``: the key of the observation that it comes from.
     """
 
@@ -57,7 +57,7 @@ class Step:
 
 
 def processors(steps: list[Step]) -> Any:
-    """LeRobot's pipeline of these."""
+    """LeRobot's pipeline of these steps."""
     return PolicyProcessorPipeline(
         steps=[ProcessorStepRegistry.get(step.name)(**step.config) for step in steps]
     )
@@ -108,7 +108,7 @@ def _declared(declared: object) -> Iterator[Step]:
 
 
 def _is_configured(config: object, kinds: Mapping[str, type[Any]]) -> bool:
-    """Whether it has these fields, all of texts."""
+    """Whether a configuration has exactly these fields, of these types, with texts."""
     if not isinstance(config, dict) or config.keys() != kinds.keys():
         return False
     for key, value in config.items():
@@ -148,7 +148,7 @@ def features_of(
 
 
 def left_out(observations: Space[Any], seen: Mapping[str, Feature]) -> list[str]:
-    """The keys of an observation of which a policy sees nothing."""
+    """The keys of an observation that no policy sees."""
     if not isinstance(observations, Dict):
         return [f"the {type(observations).__name__}"]
     sources = {item.source for item in seen.values()}
@@ -156,7 +156,7 @@ def left_out(observations: Space[Any], seen: Mapping[str, Feature]) -> list[str]
 
 
 def _passed_on(name: str, space: Space[Any], others: bool) -> Iterator[tuple[str, Feature]]:
-    """What ``preprocess_observation`` makes of one key."""
+    """The features that ``preprocess_observation`` makes of one key."""
     if name == "pixels":
         yield from _pixels(space)
     elif name in _NAMED and isinstance(space, Box):
@@ -195,7 +195,7 @@ def _boxes(space: Any) -> dict[str, Box]:
 
 
 def _inner(spaces: Mapping[str, Any], path: tuple[str, str]) -> Any:
-    """What lies at a path of a ``robot_state``."""
+    """The space at a path in a ``robot_state``."""
     group = getattr(spaces.get("robot_state"), "spaces", {}).get(path[0])
     return getattr(group, "spaces", {}).get(path[1])
 

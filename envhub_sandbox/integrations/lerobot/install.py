@@ -59,7 +59,7 @@ def install(**options: Any) -> None:
 
 @dataclass(frozen=True)
 class _HubRequest:
-    """What stands for the downloaded file, and then for the module that it would be."""
+    """Replaces the downloaded file, and then the module that LeRobot would import from it."""
 
     reference: str
     hub_cache_dir: str | None
@@ -67,22 +67,22 @@ class _HubRequest:
 
 @dataclass(frozen=True)
 class _Routing:
-    """The three steps, of which only the last does anything."""
+    """Replaces LeRobot's three steps; only the last makes environments."""
 
     options: dict[str, Any]
 
     def download(
         self, cfg_str: str, trust_remote_code: bool, hub_cache_dir: str | None
     ) -> tuple[str, str, _HubRequest, None]:
-        """Nothing yet."""
+        """Download nothing; return the request for the next steps."""
         return cfg_str, "", _HubRequest(cfg_str, hub_cache_dir), None
 
     def load(self, local_file: _HubRequest, repo_id: str) -> _HubRequest:
-        """Nothing is imported."""
+        """Import nothing; return the request."""
         return local_file
 
     def call(self, module: _HubRequest, n_envs: int, use_async_envs: bool, cfg: Any) -> EnvSuites:
-        """The environments, from the sandbox."""
+        """Make the environments in the sandbox."""
         if isinstance(cfg, SandboxedEnvConfig):
             return cfg.create_envs(n_envs, use_async_envs)
         suites = make_env(
@@ -96,7 +96,7 @@ class _Routing:
 
 
 class _AsyncOrSandboxed(type):
-    """What ``lerobot_eval`` draws frames of by ``call("render")``."""
+    """The metaclass of a class whose instances ``lerobot_eval`` renders by ``call("render")``."""
 
     def __instancecheck__(cls, instance: Any) -> bool:
         return isinstance(instance, (gymnasium.vector.AsyncVectorEnv, SandboxVectorEnv))
