@@ -110,7 +110,7 @@ class Program(TyperGroup):
             return super().main(args, *more, **options)
 
     def make_context(self, *args: Any, **options: Any) -> Any:
-        """Parse what stands before a command."""
+        """Parse the options before a command."""
         with _wrong_usage():
             return super().make_context(*args, **options)
 
@@ -175,7 +175,7 @@ class Command(TyperCommand):
 
 
 def _comes_later(parameter: Any) -> bool:
-    """Whether it is an option of ``make_env`` that few need."""
+    """Whether a parameter is an option of ``make_env`` that few users need."""
     panels = {option.panel for option in OPTIONS.values()}
     panel = getattr(parameter, "rich_help_panel", None)
     return panel in panels and not _FIRST.intersection(parameter.opts)
@@ -239,4 +239,4 @@ def envhub(
         ),
     ] = False,
 ) -> None:
-    """What stands before a command."""
+    """The options before a command."""

@@ -40,7 +40,7 @@ class Stored(Protocol):
         """Bytes of all files."""
 
     def answers_to(self, name: str) -> bool:
-        """Whether a name means it."""
+        """Whether a name means this entry."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class StoredSnapshot:
 
     @property
     def name(self) -> str:
-        """What people know it by."""
+        """The entry's name for people."""
         return self.folder or self.repository
 
     def answers_to(self, name: str) -> bool:
@@ -83,7 +83,7 @@ class StoredSnapshot:
 
 
 def stored_snapshots() -> list[StoredSnapshot]:
-    """Everything in the store, the latest used first. Nothing is verified."""
+    """The snapshots in the store, the last used first. Verifies nothing."""
     from envhub_sandbox.system.folders import cache_root
 
     folder = cache_root() / "snapshots"
@@ -156,7 +156,7 @@ def list_(json: opt.Json = False) -> None:
 
 
 def _every(module: str) -> list[Any]:
-    """All that an extra has stored; nothing where it is not installed."""
+    """The entries that an extra has stored; empty if it is not installed."""
     every = extras.find(module, "every")
     return [] if every is None else list(every())
 
@@ -232,7 +232,7 @@ def remove(
 
 
 def _users_of(snapshot: StoredSnapshot) -> str:
-    """Remove a snapshot; who uses it, if somebody does: then it stays."""
+    """Remove a snapshot, unless processes use it; returns a sentence about these, or empty."""
     from envhub_sandbox.hub import store
 
     users = [f"process {pid} ({command})" for pid, command in store.remove(snapshot.home).items()]

@@ -57,7 +57,7 @@ _SANDBOX = "process" if IS_LINUX else "docker"
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of one profile.
+    """The result of trying one profile.
 
     Attributes:
         available: A jail under it ran.
@@ -225,7 +225,7 @@ def resources(problem: str | None) -> dict[str, Any]:
 
 
 def probe() -> dict[str, Any]:
-    """What came of each layer by itself: ``layers``, an ``apparmor_profile`` or None, and ``gpu``.
+    """The result of each layer alone: ``layers``, an ``apparmor_profile`` or None, and ``gpu``.
 
     ``gpu`` are the device nodes that ``gpu=True`` grants, or None where that cannot be seen.
     """

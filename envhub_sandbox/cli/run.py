@@ -48,7 +48,7 @@ Verbose = Annotated[
 
 
 class ActionSource(str, Enum):
-    """Where actions come from."""
+    """The source of actions."""
 
     RANDOM = "random"
     ZERO = "zero"

@@ -1,4 +1,4 @@
-"""The only place that writes to stdout and stderr: what a stranger chose is text and no more.
+"""The only module that writes to stdout and stderr; it prints strangers' texts as plain text.
 
 Control characters are escaped, and rich's markup is not read. Only in a terminal are long lines
 wrapped, below their beginning: a log has each as one line. CI systems obey what they find in a log:
@@ -35,29 +35,29 @@ if TYPE_CHECKING:
     from envhub_sandbox.play.episodes import EpisodeCounter
 
 _PLAIN_WIDTH = 120
-"""Columns where there is no terminal to ask; only progress bars and boxes obey it."""
+"""The columns without a terminal, for progress bars and boxes alone."""
 _LINE, _LONGEST = 200, 2_000
 _WORD = 12
-"""Columns of what stands in front of a line: the kind of a fact, the severity of a finding."""
+"""The columns of a line's first word: the kind of a fact, or the severity of a finding."""
 _NARROWEST = 20
 """Columns of the last cell in a table, below which it is not wrapped."""
 GOOD, DOUBTFUL, BAD = "bold green", "bold yellow", "bold red"
-"""Styles of what a command concludes."""
+"""The styles of a command's conclusions."""
 _MOST = 1 << 20
-"""Characters of one text: a flood is no message."""
+"""The most characters of one text."""
 _BREAK = "\n\r\v\f\x1c-\x1e\x85\u2028\u2029"
 _SPACE = rf"(?:[^\S{_BREAK}]|\x1b\[[0-9;?]*[A-Za-z])*"
-"""What a CI system skips before a command; a terminal's colours count as nothing."""
+"""The text that a CI system skips before a command, including terminal colours."""
 _COMMAND = re.compile(
     rf"(?:\A|(?<=[{_BREAK}])){_SPACE}:(?P<colon>:)"
     r"|##\w{0,16}(?P<bracket>\[)|section_(?:start|end)(?P<section>:)"
 )
 _TAIL = 32
-"""Characters of a line that the next write may make a command of."""
+"""The last characters of a line that the next write may complete to a command."""
 
 
 def neutralised(text: str, after: str = "") -> str:
-    """Text that no CI system obeys: one character of each command is written as an escape.
+    """Escape one character of each command in a text, so that no CI system obeys it.
     ``after``: what stands in the same line already; it is no part of the result.
     """
 
@@ -98,7 +98,7 @@ class _SafeStream:
 
 
 def _end_of_line(text: str) -> str:
-    """As much of the last line as decides whether the next write completes a command."""
+    """The end of the last line, which the next write may complete to a command."""
     line = re.split(f"[{_BREAK}]", text)[-1]
     start = re.sub(rf"\A{_SPACE}", "", line)
     return start if start in ("", ":") else f"x{start[-_TAIL:]}"
@@ -153,13 +153,13 @@ def say(text: str, style: str | None = None) -> None:
 
 
 def show(word: str, text: object = "", style: str | None = None, *, stderr: bool = False) -> None:
-    """Print a line: a word of ours, and what may be a stranger's."""
+    """Print a line: a word of ours, and a text that may be a stranger's."""
     line = _hanging(f"{word:{_WORD}} ", safe_line(text, _LONGEST), stderr=stderr)
     say(line, style) if stderr else out(line, style)
 
 
 def show_below(text: str, margin: str = "  ") -> None:
-    """Print a text below a line that is its title, each line of it behind a margin."""
+    """Print a text below its title, each line after a margin."""
     for line in safe_text(text).splitlines():
         out(_hanging(margin, line))
 
@@ -210,13 +210,13 @@ def safe_text(text: object, limit: int = 16_384) -> str:
 
 
 def safe_line(text: object, limit: int = _LINE) -> str:
-    """The same on one line, cut at its end."""
+    """``safe_text`` on one line, cut at its end."""
     line = printable(str(text), limit=10 * limit).replace("\n", " ").replace("\t", " ")
     return line if len(line) <= limit else f"{line[: limit - 1]}…"
 
 
 _json_left: ContextVar[bool] = ContextVar("_json_left", default=False)
-"""Whether a document was asked for, and has not been printed."""
+"""Whether the user wants a JSON document that was not printed yet."""
 
 
 @contextlib.contextmanager
@@ -250,7 +250,7 @@ def _escaped(char: str) -> str:
 
 
 def plain(value: Any) -> Any:
-    """What JSON knows: arrays become lists, numbers that are not finite null, the rest text."""
+    """A value for JSON: arrays become lists, infinite numbers and NaN null, the rest text."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if hasattr(value, "tolist"):  # arrays and numpy's scalars
@@ -264,7 +264,7 @@ def plain(value: Any) -> Any:
 
 @contextlib.contextmanager
 def prints_on_stderr() -> Iterator[None]:
-    """Keep stdout to the results: what Python prints meanwhile, and what libraries do."""
+    """Within this context, send prints of Python and of libraries to stderr, not to stdout."""
     sys.stdout.flush()
     kept = os.dup(1)
     os.dup2(2, 1)
@@ -278,7 +278,7 @@ def prints_on_stderr() -> Iterator[None]:
 
 @contextlib.contextmanager
 def says_what_is_seen() -> Iterator[None]:
-    """While it lasts, a line on stderr says what the code gets to see of this machine."""
+    """Within this context, print on stderr which files of this machine the code can see."""
     with told_by(lambda line: say(safe_line(line, _LONGEST))):
         yield
 

@@ -20,7 +20,7 @@ _TAIL_LINES = 10
 
 
 class Exit(IntEnum):
-    """What the command's exit code says; ``docs/cli.md`` has the same table."""
+    """The exit codes of a command and their meanings; ``docs/cli.md`` has the same table."""
 
     meaning: str
 
@@ -51,7 +51,7 @@ EXIT_CODES = f"Exit codes: {'; '.join(f'{int(code)} {code.meaning}' for code in 
 
 
 class UsageError(EnvHubError):
-    """What was asked for cannot be; the text says what to ask for instead."""
+    """The command's arguments are invalid; the text says what to write instead."""
 
 
 class ForeignError(EnvHubError):
@@ -100,7 +100,7 @@ def describe(error: BaseException) -> str:
 
 
 def _is_full(error: BaseException) -> bool:
-    """Whether a disk of the caller's is full, or his share of it."""
+    """Whether a disk of the caller, or the caller's quota on it, is full."""
     full = (errno.ENOSPC, errno.EDQUOT)
     return isinstance(error, OSError) and error.errno in full and not isinstance(error, EnvHubError)
 
@@ -150,7 +150,7 @@ def _explain(error: Exception, debug: bool) -> None:
 
 
 def _discard_output() -> None:
-    """What is buffered and cannot be written must not fail again when the interpreter ends."""
+    """Discard buffered output, which would fail again when the interpreter ends."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()

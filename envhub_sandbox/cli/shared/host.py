@@ -1,4 +1,4 @@
-"""What there is on this machine: versions of everything that matters, and memory that is free."""
+"""Facts about this machine: the versions of programs and packages, and the free memory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _PACKAGES = ("gymnasium", "numpy", "huggingface_hub", "pyzmq", "msgpack", "image
 
 
 def versions() -> dict[str, str | int | None]:
-    """Ours, and of what we stand on; None for what is not installed."""
+    """The versions of this package and its dependencies; None for a missing package."""
     from envhub_sandbox import __version__
     from envhub_worker.protocol.messages import VERSION
 
@@ -34,13 +34,13 @@ _FILES = (
     ("memory.max", "memory.current", "inactive_file"),
     ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
 )
-"""Of each version: the limit, what is used, and what of this the kernel would give back."""
+"""For each version of control groups, the files of the limit, the usage and reclaimable memory."""
 _UNLIMITED = 1 << 60
-"""The first version writes no limit as the largest number of pages."""
+"""Version 1 writes "no limit" as the largest number of pages."""
 
 
 def free_memory_bytes(proc: Path = Path("/proc")) -> int | None:
-    """What is free, or the kernel would give back; None where it does not say.
+    """The bytes that are free or that the kernel can reclaim; None if it does not say.
 
     A control group that we are in, or one around it, may have less left than the machine: that of
     a container, or of a service.

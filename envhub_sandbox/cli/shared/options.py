@@ -1,4 +1,4 @@
-"""The options of ``make_env`` as parameters of commands: declared, read, and handed on."""
+"""The options of ``make_env`` as parameters of commands: declares, reads and passes them on."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def with_options(*keys: str, **defaults: Any) -> Callable[[_Command], _Command]:
 
 
 def _keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
-    """A parameter whose place in a signature says nothing."""
+    """A keyword-only parameter."""
     kind = inspect.Parameter.KEYWORD_ONLY
     return inspect.Parameter(name, kind, default=default, annotation=annotation)
 
@@ -126,7 +126,7 @@ def _parameter(key: str, others: Sequence[str], defaults: Mapping[str, Any]) -> 
 
 
 def _completion(metavar: str) -> Callable[[], list[str]] | None:
-    """What a shell completes: what a metavar has in small letters."""
+    """The values for a shell's completion: the parts of a metavar in lower case."""
     matches = [re.match(r"[a-z][a-z:/-]*", word) for word in metavar.split("|")]
     words = [match[0] for match in matches if match is not None]
     return words.copy if words else None
@@ -134,7 +134,7 @@ def _completion(metavar: str) -> Callable[[], list[str]] | None:
 
 @dataclass(frozen=True)
 class MakeOptions:
-    """What a command line says about ``make_env``.
+    """The options of ``make_env`` on a command line.
     ``typed``: the values of the options that the command has, as typed, by keys of ``OPTIONS``.
     """
 
@@ -149,25 +149,25 @@ class MakeOptions:
         return value if reader is None else reader(value)
 
     def snapshot(self, ref: str, *, public: bool = False) -> Snapshot:
-        """What a reference names, fetched; see ``fetch`` for ``public``."""
+        """Fetch the snapshot of a reference; ``public`` as for ``fetch``."""
         from envhub_sandbox.hub.snapshot import snapshot_named
 
         return snapshot_named(ref, **self.source, public=public)
 
     def snapshot_with_assets(self, ref: str, locked: Sequence[str] = ()) -> Snapshot:
-        """The same, with its assets: those of the command line, or of a lock."""
+        """Fetch a snapshot with its assets, from the command line or from a lock."""
         from envhub_sandbox.hub.snapshot import with_assets
 
         return with_assets(self.snapshot(ref), self.typed.get("assets") or (), self.hub, locked)
 
     @property
     def source(self) -> dict[str, Any]:
-        """Where a reference is looked for, and how."""
+        """The arguments of ``snapshot_named`` for the reference."""
         return {key: self.typed[key] for key in SOURCE}
 
     @property
     def hub(self) -> dict[str, Any]:
-        """Which Hub, and how."""
+        """The arguments that choose the Hub, its login and its cache."""
         return {key: self.typed[key] for key in _HUB}
 
     @property
@@ -240,7 +240,7 @@ def read_gpu(text: str | None) -> bool | list[int] | None:
 
 
 def is_typed(context: typer.Context, name: str) -> bool:
-    """Whether a parameter stands on the command line, and not in a file or nowhere."""
+    """Whether a parameter is on the command line, and not from a file or a default."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
 
@@ -287,4 +287,4 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "output": functools.partial(_none_for, "-"),  # the log of run
     "gpu": read_gpu,
 }
-"""How values are made of what was typed, where the two are not the same."""
+"""Functions that convert typed texts to values, for options that need it."""

@@ -1,4 +1,4 @@
-"""What a rollout gave, as data for ``--json`` and as text for people."""
+"""The results of a rollout, as data for ``--json`` and as text for people."""
 
 from __future__ import annotations
 
