@@ -1,1 +1,1 @@
-"""Features that the core finds by name and does without."""
+"""Optional features, which the core finds by name and works without."""

@@ -1,10 +1,10 @@
-"""Which files and which processes a waiting call asks for. What is seen decides nothing.
+"""Finds which files and processes a waiting call names, for the record only: it decides nothing.
 
-The kernel always goes on with a call that names a file: whether it may is decided by it, by mounts
-and Landlock, and nothing here can make it another. Its path is read in a stranger's memory a moment
-later, which another thread may have changed since, so that it is evidence of an attempt and proof
-of nothing. The number of a process stands in a register, so that it is what the kernel will read;
-whether the call may reach that process is decided by the kernel, or by ``notify``.
+The kernel always continues a call that names a file, and the kernel alone decides it, by mounts and
+Landlock. This module reads the path from a stranger's memory a moment later, when another thread
+may have changed it: so a path is evidence of an attempt, but no proof. A process's pid is in a
+register, so the kernel reads the same; whether the call may reach that process is decided by the
+kernel, or by ``notify``.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ _HARMLESS = ("/var/run/nscd/socket", "/run/nscd/socket")
 def asked(
     call: str, words: Sequence[int], thread: int, own: OwnPaths, still_waits: Callable[[], object]
 ) -> list[tuple[str, str]]:
-    """What a waiting call asks for and is not its own: what it would do, and each path, shown.
+    """Returns the targets of a waiting call outside its jail: the action, and each printable path.
 
     Args:
-        call: Its name, one of ``NAMED``.
-        words: Its arguments, as the registers are.
-        still_waits: Raises OSError where the caller has gone: its number may be another's now.
+        call: The name of the call, one of ``NAMED``.
+        words: Its arguments, as in the registers.
+        still_waits: Raises OSError if the caller has ended: its pid may belong to another process.
     """
     with contextlib.suppress(OSError, ValueError, OverflowError):
         with open(f"/proc/{thread}/mem", "rb", buffering=0) as memory:
@@ -76,7 +76,7 @@ def asked(
 
 
 def _deed(call: str, words: Sequence[int]) -> tuple[str, bool]:
-    """What a call does, and whether it follows a link at the end of its path."""
+    """Returns a call's action, and whether it follows a link at the end of its path."""
     if call in _FLAGS:
         flags = words[_FLAGS[call]]
     elif call in _FLAGS_OF_AT:
@@ -97,7 +97,7 @@ def _named(
     folder: int | None,
     path: int,
 ) -> str:
-    """The path that is named; empty where it is none, or has no end."""
+    """Reads the path at an address; empty if there is no text or it has no end."""
     text = _text(memory, words[path])
     if not text:
         return ""
@@ -120,10 +120,10 @@ def _text(memory: BinaryIO, address: int) -> bytes:
 
 
 def _absolute(thread: int, base: str, text: bytes, own: OwnPaths, *, last: bool) -> str:
-    """Where a path leads from where its caller stands; a base that is no folder makes none.
+    """Returns the absolute path, from the caller's base folder; empty if the base is no folder.
 
-    What its own folders have of links is followed, at the end only where ``last``; what they lead
-    to is a name, and is not looked for. Another thread may make them others meanwhile.
+    Follows links in the jail's own folders, at the end of the path only if ``last``. Their targets
+    are taken as names and not looked up. Another thread may change the links meanwhile.
     """
     path = os.fsdecode(text)
     if not path.startswith("/"):
@@ -146,7 +146,7 @@ def _absolute(thread: int, base: str, text: bytes, own: OwnPaths, *, last: bool)
 
 
 def _leads(thread: int, path: str, own: OwnPaths, pending: Sequence[str], *, last: bool) -> str:
-    """The target of an entry of /proc, or of a link in one of the jail's own folders; else empty.
+    """Returns the target of an entry of /proc or of a link in the jail's own folders; else empty.
     Raises ``ValueError``: the entry leads to something without a path, such as a socket.
     """
     door = _DOORS.fullmatch(path)
@@ -163,7 +163,7 @@ def _leads(thread: int, path: str, own: OwnPaths, pending: Sequence[str], *, las
 
 
 def _link(thread: int, folder: str, names: Sequence[str]) -> str:
-    """The target of a link; empty if it is none. No other link is followed on the way to it."""
+    """Returns the target of a link; empty for other files. Follows no link on the way to it."""
     if len(names) > _DEEPEST:
         return ""
     descriptor = os.open(f"/proc/{thread}/root{folder}", os.O_PATH | os.O_DIRECTORY)
@@ -180,7 +180,7 @@ def _link(thread: int, folder: str, names: Sequence[str]) -> str:
 
 
 def _addressed(memory: BinaryIO, start: int, size: int, thread: int, own: OwnPaths) -> str:
-    """The socket's file; one without a name in the file system is the jail's own network's."""
+    """Returns a socket's file; empty for a socket without a file: that is in the jail's network."""
     address = os.pread(memory.fileno(), min(size & 0xFFFFFFFF, _SOCKET_ADDRESS), start)
     text = address[2:].partition(b"\0")[0]
     if address[:2] != struct.pack("=H", _AF_UNIX) or not text:

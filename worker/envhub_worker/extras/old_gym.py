@@ -1,9 +1,9 @@
-"""Environments of ``gym``, Gymnasium's predecessor, as environments of Gymnasium, and those of
-Gymnasium whose ``reset`` is still that of ``gym``.
+"""Adapts environments of ``gym``, Gymnasium's predecessor, and environments of Gymnasium with a
+``reset`` as in ``gym``.
 
-``gym`` is maintained no more, and much of what was published needs it. From 0.21 to 0.26 it changed
-what an environment is, and authors of one release run on another, so that nothing here asks for a
-version. It looks at what an environment takes and gives:
+Nobody maintains ``gym``, but many published environments need it. Its interface changed between
+0.21 and 0.26, and environments for one release run on another. So this module never checks a
+version, but what an environment takes and returns:
 
 - ``reset`` with ``seed`` where the environment and all its wrappers take one, else ``seed()``
   before it, and for a class of Gymnasium its ``np_random``; with an info or without.
@@ -47,22 +47,22 @@ _MODES = ("rgb_array", "ansi")
 
 
 class OldSpaceError(TypeError):
-    """A space of ``gym`` that has no counterpart here."""
+    """A space of ``gym`` has no counterpart in Gymnasium."""
 
 
 def is_env(value: object) -> bool:
-    """Whether it is an environment of ``gym``, and not one of Gymnasium."""
+    """Whether an object is an environment of ``gym``, not of Gymnasium."""
     return not isinstance(value, gym.Env) and compat.descends_from(value, "gym.core", "Env")
 
 
 def is_vector(value: object) -> bool:
-    """Whether it is a vector environment of ``gym``, each of which is an ``Env`` there."""
+    """Whether an object is a vector environment of ``gym``, where that is an ``Env``."""
     return is_env(value) and compat.descends_from(value, "gym.vector.vector_env", "VectorEnv")
 
 
 def adapted(env: Any) -> Any:
-    """An environment of ``gym``, or with a ``reset`` as before Gymnasium 0.26, as one of today;
-    any other as it is.
+    """Adapts an environment of ``gym``, or one with a ``reset`` as before Gymnasium 0.26; returns
+    any other unchanged.
     """
     if is_env(env):
         return _warned(OldEnv, env)
@@ -75,7 +75,7 @@ def adapted(env: Any) -> Any:
 
 
 def _is_as_before(env: Any) -> bool:
-    """Whether its ``reset`` cannot be given what Gymnasium gives, or still has ``return_info``."""
+    """Whether ``reset`` does not take Gymnasium's arguments, or still has ``return_info``."""
     parameters = parameters_of(env.reset)
     if parameters is None:
         return False
@@ -84,7 +84,7 @@ def _is_as_before(env: Any) -> bool:
 
 
 def _converted(env: Any, above: Any, layer: Any) -> Any:
-    """``env`` with an ``OldEnv`` around one of its layers, of which the next one is ``above``."""
+    """Puts an ``OldEnv`` around a layer of ``env``, below the layer ``above``."""
     message = f"{_where(layer, 'reset')} is as before Gymnasium 0.26"
     warnings.warn(
         f"{message}. It runs through a compatibility wrapper of the sandbox, which seeds it by its "
@@ -101,7 +101,7 @@ def _converted(env: Any, above: Any, layer: Any) -> Any:
 
 
 def adapted_vector(env: Any) -> Any:
-    """A vector environment of ``gym`` as one of Gymnasium."""
+    """Adapts a vector environment of ``gym``."""
     return _warned(OldVectorEnv, env)
 
 
@@ -117,14 +117,14 @@ def _warned(adapter: Callable[[Any], Any], env: Any) -> Any:
 
 
 class _Reset:
-    """How an environment is reset: by what it takes, with every wrapper that it goes through."""
+    """Resets an environment with the arguments that it and all its wrappers take."""
 
     def __init__(self, env: Any) -> None:
         self._env = env
         self._takes = frozenset(name for name in _OPTIONAL if _passes(env, name))
 
     def __call__(self, seed: Any, options: Any) -> tuple[Any, Any]:
-        """The observation, and the info where it gives one."""
+        """Resets; returns the observation, and the info if there is one."""
         if seed is not None and "seed" not in self._takes:
             self._seed(seed)
         offered = {"seed": seed, "options": options, "return_info": True}
@@ -159,10 +159,10 @@ def _takes(method: Any, name: str) -> bool:
 
 
 class OldEnv(gym.Env[Any, Any]):
-    """An environment of ``gym``. What Gymnasium's do not have is looked up, and set, in it."""
+    """Wraps an environment of ``gym``; reads and sets attributes beyond Gymnasium's in it."""
 
     def __init__(self, env: Any) -> None:
-        # a wrapper of Gymnasium's passes no mode on
+        # Gymnasium's wrappers do not pass a mode on.
         drawing = [
             layer
             for layer in compat.layers(env)
@@ -185,15 +185,15 @@ class OldEnv(gym.Env[Any, Any]):
         )
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, Any]:
-        """As Gymnasium's, whichever way the environment is seeded."""
+        """Like Gymnasium's ``reset``; seeds the environment in the way that it supports."""
         return self._reset(seed, options)  # type: ignore[no-any-return]
 
     def step(self, action: Any) -> Any:
-        """As Gymnasium's."""
+        """Like Gymnasium's ``step``."""
         return convert_to_terminated_truncated_step_api(self.env.step(action))
 
     def render(self) -> Any:
-        """In the mode of ``render_mode``."""
+        """Renders in the mode of ``render_mode``."""
         return self._draw()
 
     def close(self) -> None:
@@ -207,7 +207,7 @@ class OldEnv(gym.Env[Any, Any]):
 
     @property
     def np_random(self) -> Any:
-        """Its generator; before 0.22 a ``RandomState``."""
+        """The environment's generator; before 0.22 a ``RandomState``."""
         return self.env.np_random
 
     @np_random.setter
@@ -216,7 +216,7 @@ class OldEnv(gym.Env[Any, Any]):
 
     @property
     def np_random_seed(self) -> int:
-        """Its own, or -1, as Gymnasium says of a generator whose seed is not known."""
+        """The environment's seed; -1 if unknown, as in Gymnasium."""
         return int(getattr(self.env, "np_random_seed", -1))
 
     def __getattr__(self, name: str) -> Any:
@@ -232,7 +232,7 @@ class OldEnv(gym.Env[Any, Any]):
 
 
 class OldVectorEnv:
-    """A vector environment of ``gym``, as it is: it resets in the step that ends an episode."""
+    """Wraps a vector environment of ``gym``, which resets in the step that ends an episode."""
 
     def __init__(self, env: Any) -> None:
         self.env = env
@@ -247,12 +247,12 @@ class OldVectorEnv:
         self._reset = _Reset(env)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Any, Any]:
-        """The observations and infos, as Gymnasium has them."""
+        """Resets; returns observations and infos in Gymnasium's form."""
         observation, infos = self._reset(seed, options)
         return observation, self._joined(infos)
 
     def step(self, actions: Any) -> Any:
-        """Five results, as Gymnasium has them."""
+        """Steps; returns five results in Gymnasium's form."""
         if self._in_turn:
             actions = tuple(iterate(self.action_space, actions))
         *results, infos = self.env.step(actions)
@@ -265,7 +265,7 @@ class OldVectorEnv:
         return observation, rewards, *flags, self._joined(infos)
 
     def _joined(self, infos: Any) -> Any:
-        """Before 0.24 there is a list of them, one of each sub-environment."""
+        """Joins infos: before 0.24 they are a list with one dict per sub-environment."""
         if isinstance(infos, Mapping):
             return compat.renamed(infos)
         pairs = [(index, info) for index, info in enumerate(infos) if info]
@@ -278,7 +278,7 @@ class OldVectorEnv:
 
 
 def _metadata_of(env: Any) -> dict[str, Any]:
-    """With the names that Gymnasium gives to what 0.21 calls otherwise."""
+    """Returns metadata with Gymnasium's names for keys that 0.21 names differently."""
     metadata = dict(getattr(env, "metadata", None) or {})
     modes: Any = metadata.get("render_modes", metadata.get("render.modes"))
     metadata["render_modes"] = list(modes or ())
@@ -296,8 +296,8 @@ def _spec_of(env: Any) -> EnvSpec | None:
 
 
 def space_of(space: Any) -> Any:
-    """The same space, of Gymnasium's class; a subclass becomes what it is derived from.
-    Raises ``OldSpaceError``: it is of none of the classes that are known.
+    """Converts a space to Gymnasium's class; a subclass becomes its known base class.
+    Raises ``OldSpaceError``: no base class of the space is known.
     """
     if isinstance(space, gym.Space):
         return space
@@ -330,8 +330,8 @@ _RETURNS = {
 
 
 def explained(error: Exception, env: Any, method: str) -> Exception:
-    """The error itself, or one that says that the environment's ``method`` is as before 0.26.
-    ``error``: what calling it as of today, and taking its result apart, has raised.
+    """Returns the error, or one that explains that the environment's ``method`` is as before 0.26.
+    ``error``: the error of calling the method, or unpacking its result, as of today.
     """
     text = str(error)
     unpacked = "to unpack" in text or "cannot unpack" in text
@@ -349,7 +349,7 @@ def explained(error: Exception, env: Any, method: str) -> Exception:
 
 
 def _where(env: Any, method: str) -> str:
-    """A method as its author finds it."""
+    """Names a method so that its author finds it."""
     name = f"{type(env).__qualname__}.{method}"
     code = getattr(getattr(type(env), method), "__code__", None)
     if code is None:

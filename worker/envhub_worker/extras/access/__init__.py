@@ -1,1 +1,1 @@
-"""Who may come in, and what a client may ask and use up."""
+"""Access for clients on other hosts: keys, quotas, uploads, and the commands of ``listen``."""

@@ -1,13 +1,13 @@
-"""A TCP port whose clients prove a key before they are heard; it bounds peers without rules.
+"""A TCP port that reads messages only from clients with a proved key, and limits all connections.
 
 ``CurvePort`` answers ZeroMQ's authentication protocol (ZAP, https://rfc.zeromq.org/spec/27) in the
-server's own loop. pyzmq's authenticators have a thread or an event loop of their own; the server
-has one thread and one poll, so this asks for no lock.
+server's own loop. pyzmq's authenticators have a thread or an event loop of their own; this one
+needs no lock, since the server has one thread and one poll.
 
-``ConnectionLimiter`` knows which connections are open, and lets no more in while there are too many
-of them. Strangers make them, too, and each takes a descriptor and memory before any key is asked
-for. libzmq cannot pause its listener, and ends a listener's connections with it. So a filter has
-the kernel drop what knocks: connections that are open stay, and who knocks again later is let in.
+``ConnectionLimiter`` counts open connections and admits no more if there are too many. Strangers
+open connections, too, and each takes a descriptor and memory before a key is checked. libzmq cannot
+pause its listener, and closes a listener's connections with it. So a socket filter makes the kernel
+drop new connections: open ones stay, and a peer that tries again later gets in.
 """
 
 from __future__ import annotations
@@ -50,16 +50,16 @@ _DROP = struct.pack("=HBBI", 0x06, 0, 0, 0)  # BPF: return 0 bytes of the packet
 
 
 class CurvePort:
-    """What a ``RemoteGate`` does at its socket: CURVE, and what bounds a peer without rules.
+    """The socket of a ``RemoteGate``: CURVE authentication, and limits for every peer.
 
     Args:
-        router: Not bound yet.
+        router: The socket, not bound yet.
         keys: The server's key pair; None only for ``--insecure-loopback``.
-        admits: Called with a client's public key and address; whether it may come in.
-        max_connections: Of everybody together, strangers included.
+        admits: Called with a client's public key and address; returns whether it may connect.
+        max_connections: Maximum number of connections, strangers' included.
 
     Attributes:
-        connections: Those that are open.
+        connections: The open connections.
     """
 
     def __init__(
@@ -88,11 +88,11 @@ class CurvePort:
         router.setsockopt(zmq.CURVE_SERVER, 1)
         router.setsockopt(zmq.CURVE_SECRETKEY, keys.secret)
         router.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN)
-        # without it libzmq lets everybody in whom no handler was there to ask about
+        # Without this option libzmq admits every peer if no ZAP handler is bound.
         router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
     def _answer(self, zap: zmq.Socket[bytes]) -> None:
-        """Answer every question of libzmq's about a handshake that is there."""
+        """Answer libzmq's waiting questions about handshakes."""
         while True:
             try:
                 frames = zap.recv_multipart(zmq.NOBLOCK)
@@ -113,9 +113,9 @@ class CurvePort:
         return key
 
     def receive(self, router: zmq.Socket[bytes]) -> Incoming:
-        """The key is the one that was proved in the handshake, never what the peer claims."""
+        """Receive a message; its key is the one proved in the handshake, not a peer's claim."""
         identity = router.recv(zmq.NOBLOCK)
-        # not of the frame before: libzmq 4.3.4 knows nothing of who sent the first one
+        # From the last frame: libzmq 4.3.4 has no metadata of the first one.
         header = router.recv(zmq.NOBLOCK, copy=False)
         rest = receive(router) if header.more else []
         frames = [header.bytes, *rest]
@@ -144,8 +144,8 @@ def _descriptor_of(frame: zmq.Frame) -> int:
 
 
 class ConnectionLimiter:
-    """Watches a socket's connections. To be made before it is bound.
-    ``limit``: connections at once. The backlog may come in besides.
+    """Watches a socket's connections. Make it before the socket is bound.
+    ``limit``: maximum of open connections; those in the backlog may still be added.
     """
 
     def __init__(self, router: zmq.Socket[bytes], loop: Loop, log: Log, limit: int) -> None:
@@ -181,15 +181,15 @@ class ConnectionLimiter:
             self._log.say("handshake_failed", why="no key, another server's, or noise")
 
     def wire(self, fd: int) -> int:
-        """The number of the connection that a message has come from; 0 if that has ended since.
+        """Returns the number of a message's connection; 0 if the connection has ended since.
 
-        A descriptor's number is given out again, this one never, and none has 0.
+        Unlike a descriptor's number, this number is never reused. No connection has 0.
         """
         self._drain()  # libzmq says that it has accepted before it hands anything on
         return self._wires.get(fd, 0)
 
     def open_wires(self) -> frozenset[int]:
-        """The numbers of all connections that are there now."""
+        """Returns the numbers of all open connections."""
         self._drain()
         return frozenset(self._wires.values())
 
@@ -221,17 +221,17 @@ class ConnectionLimiter:
 
     def close(self) -> None:
         """Stop watching."""
-        # libzmq waits where many events are not read, and holds what ``disable_monitor`` asks for
+        # libzmq blocks if many events are unread, with the lock that ``disable_monitor`` needs.
         self._drain()
         if self._shut_listener is not None:
             self._shut_listener.close()
-        # in this order: a context does not end while the monitor's other end is open
+        # In this order: a context does not end while the monitor's other end is open.
         self._router.disable_monitor()
         self._monitor.close()
 
 
 def _listener(endpoint: str) -> socket.socket | None:
-    """The listening socket of an endpoint of ours: the kernel names it, libzmq does not."""
+    """Finds the listening socket of an endpoint by the kernel: libzmq does not expose it."""
     port = int(endpoint.rpartition(":")[2])
     for name in os.listdir("/proc/self/fd"):
         fd = int(name)

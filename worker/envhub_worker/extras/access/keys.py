@@ -1,4 +1,4 @@
-"""CURVE key pairs on disk, and the file that says whose keys may come in."""
+"""CURVE key pairs on disk, and the file of authorized clients."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ class KeyPair:
 
 
 def generate() -> KeyPair:
-    """A new key pair."""
+    """Makes a new key pair."""
     public, secret = zmq.curve_keypair()
     return KeyPair(z85.decode(public), z85.decode(secret))
 
 
 def from_secret(secret: bytes) -> KeyPair:
-    """The pair that a secret key belongs to."""
+    """Returns the pair of a secret key."""
     return KeyPair(z85.decode(zmq.curve_public(z85.encode(secret))), secret)
 
 
 def load(path: Path) -> KeyPair:
-    """The pair of a secret key's file. Raises ``OSError`` or ``ValueError``."""
+    """Reads a secret key's file; returns the pair. Raises ``OSError`` or ``ValueError``."""
     return from_secret(parse_key(_read(path)))
 
 
 def save(pair: KeyPair, folder: Path, name: str) -> tuple[Path, Path]:
-    """Write ``name.key`` (secret, 0600) and ``name.pub``; what is there already is not replaced.
-    Raises ``OSError``: they cannot be written, or are there.
+    """Write ``name.key`` (secret, 0600) and ``name.pub``; never replaces a file.
+    Raises ``OSError``: the files cannot be written, or exist.
     """
     folder.mkdir(parents=True, exist_ok=True)
     secret, public = folder / f"{name}.key", folder / f"{name}.pub"
@@ -68,14 +68,15 @@ def _read(path: Path) -> str:
 
 
 class AuthorizedClients:
-    """Public keys that may come in, and what their owners are called.
+    """The public keys of authorized clients, with names.
 
-    The file has one client a line: its public key and, after a blank, a name. ``#`` and a blank
-    begin a comment. It is read anew when it changes, so that a client can be taken off it.
+    The file has one client per line: its public key and, after a blank, a name. ``#`` and a blank
+    begin a comment. The server reads the file again when it changes, so that an operator can remove
+    a client.
 
     Args:
-        known: Keys that may come in without it.
-        most: How many may be on it; None for any number.
+        known: Keys that are authorized without the file.
+        most: Maximum number of clients in the file; None for no limit.
     """
 
     def __init__(self, path: Path | None, known: dict[bytes, str], most: int | None = None) -> None:
@@ -122,11 +123,11 @@ class AuthorizedClients:
 
     @property
     def count(self) -> int:
-        """How many keys may come in."""
+        """The number of authorized keys."""
         return len(self._names)
 
     def name_of(self, key: bytes) -> str | None:
-        """What the owner of a key is called, or None if it may not come in."""
+        """Returns the name of a key's owner, or None if the key is not authorized."""
         return self._names.get(key)
 
 

@@ -1,10 +1,10 @@
-"""Packages that clients' repositories need, where the operator permits that (``--dependencies``).
+"""Packages for clients' repositories, if the operator permits them (``--dependencies``).
 
-They are made by another program: the client's own, which the operator has installed beside this
-one, with its bounds. It chooses versions, installs wheels by their hashes, runs nothing of them,
-and says what it did. Each client key has a folder of its own and one program at work at a time, all
-keys together a few; an order that is not asked for any more is given up, and so is one that takes
-too long: it delays the others only so far.
+Another program makes them: the client package, which the operator has installed beside this one. It
+chooses versions, installs wheels by their hashes without running their code, and reports its
+result. Each client key has its own folder and at most one running program; all keys together have a
+few. The server cancels an order that its client no longer asks for, and one that takes too long, so
+that it does not delay the others.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ News = tuple[bytes, float, Mapping[str, Any]]
 
 
 class PackageProgram:
-    """The program, at work on one order.
-    ``ended_at``: when it was asked to end; None before.
+    """The program while it makes one order.
+    ``ended_at``: the time of the request to end it; None before.
     """
 
     def __init__(self, request: Mapping[str, Any]) -> None:
@@ -91,7 +91,7 @@ class PackageProgram:
             undo.pop_all()  # the output lasts as long as the program
 
     def output(self) -> Mapping[str, Any]:
-        """What the program has written last; nothing while it writes."""
+        """Returns the program's last complete output; nothing while it writes."""
         try:
             document = json.loads(os.pread(self._output.fileno(), _RESULT_BYTES, 0))
             return document if isinstance(document, dict) else {}
@@ -100,16 +100,16 @@ class PackageProgram:
 
     @property
     def code(self) -> int | None:
-        """Its exit code; None while it runs."""
+        """The exit code; None while the program runs."""
         return self._process.poll()
 
     def terminate(self, now: float) -> None:
-        """Ask it to end."""
+        """Ask the program to end."""
         self._process.terminate()
         self.ended_at = now
 
     def kill(self, patience_s: float = 0.0) -> None:
-        """Give it so long to end, then kill it and what it started."""
+        """Wait for the program's end, then kill it with the processes that it started."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(patience_s)
         with contextlib.suppress(ProcessLookupError):
@@ -117,18 +117,18 @@ class PackageProgram:
         self._process.wait()
 
     def close(self) -> None:
-        """Close its output, after it has ended."""
+        """Close the program's output, after its end."""
         self._output.close()
 
 
 @dataclass
 class Order:
-    """An order, from the first request for it until it is forgotten.
+    """An order for packages, from its first request until it is forgotten.
 
     Attributes:
-        asked: When a client asked for it last.
-        program: While it is made; an order with neither this nor a result waits.
-        result: The last words of the program, and when they came.
+        asked: The time of the last request for it.
+        program: The running program, or None. An order without program and result waits.
+        result: The program's last output, and the time of it.
     """
 
     plain: dict[str, Any]
@@ -140,12 +140,12 @@ class Order:
 
 
 def command() -> list[str]:
-    """The command line of the program, with our own interpreter."""
+    """Returns the command line of the program, with our own interpreter."""
     return [sys.executable, "-I", "-m", PROGRAM]
 
 
 def why_impossible() -> str:
-    """Why the program cannot run here; empty if it can."""
+    """Returns why the program cannot run here; empty if it can."""
     try:
         done = subprocess.run(
             [*command(), "check"], stdin=subprocess.DEVNULL, capture_output=True, timeout=_CHECK_S
@@ -184,10 +184,10 @@ class Packages:
     def need(
         self, key: bytes, request: m.NeedPackages, in_use: Collection[str], owner: bytes = b""
     ) -> m.Packages:
-        """How far they are; begins, or goes on, to make them.
+        """Starts or continues an order; returns its progress.
 
         ``in_use``: folders of packages that must stay. Trust: the request is a client's.
-        Raises ``RefusedError``: they cannot be made, or not now.
+        Raises ``RefusedError``: the packages cannot be made, or not now.
         """
         if self._folder is None:
             if not request.always:
@@ -217,7 +217,7 @@ class Packages:
         return m.Packages("making", "", {}, progress)
 
     def runtime(self, key: bytes, name: str) -> Runtime:
-        """A client's packages, and their interpreter. Raises ``RefusedError``."""
+        """Returns a client's packages and their interpreter. Raises ``RefusedError``."""
         runtime, _ = self._handed.get((self._home(key), name), (None, 0.0))
         if runtime is None or not os.path.isdir(runtime.packages):
             raise RefusedError(
@@ -229,7 +229,7 @@ class Packages:
         return SHARED if self._shared else key.hex()[:32] or "local"
 
     def look(self, in_use: Collection[str]) -> None:
-        """Take results, give up orders that nobody asks for, and start the next programs."""
+        """Take results, cancel orders that nobody asks for, and start the next programs."""
         now = monotonic()
         for order_id, order in list(self._orders.items()):
             if order.program is not None:
@@ -242,12 +242,12 @@ class Packages:
                 self._begin(order_id, in_use)
 
     def news(self) -> list[News]:
-        """The orders that have ended since the last call."""
+        """Returns the orders that have ended since the last call."""
         news, self._news = self._news, []
         return news
 
     def close(self) -> None:
-        """End the programs; they leave nothing half-made, or the next ones remove it."""
+        """End the programs; later programs remove unfinished packages."""
         programs = list(self._running().values())
         self._orders.clear()
         now = monotonic()
@@ -260,7 +260,7 @@ class Packages:
     # --- orders --------------------------------------------------------------------------------
 
     def _reply(self, order_id: OrderId) -> m.Packages | None:
-        """The answer to an order; None if it has no result, or one that no longer holds."""
+        """Returns the answer to an order; None without a result that still holds."""
         order = self._orders.get(order_id)
         if order is None or order.result is None:
             return None
@@ -297,12 +297,12 @@ class Packages:
     # --- the program ---------------------------------------------------------------------------
 
     def _running(self) -> dict[str, PackageProgram]:
-        """The programs at work, by the folder of their key: each key has one at most."""
+        """Returns the running programs by the folder of their key: each key has one at most."""
         orders = self._orders.items()
         return {home: order.program for (home, _), order in orders if order.program is not None}
 
     def _waiting(self) -> list[OrderId]:
-        """Waiting orders in turn: first that of the key for which nothing was begun for longest."""
+        """Returns waiting orders in turn: first that of the key that has waited longest."""
         orders = self._orders.items()
         waiting = [name for name, order in orders if order.program is None and order.result is None]
         return sorted(waiting, key=self._last_begun)
@@ -311,7 +311,7 @@ class Packages:
         return max(self._begun[order_id[0]], default=0.0)
 
     def _why_waiting(self, order_id: OrderId) -> str:
-        """The progress of an order that waits. Of others it says only how many there are."""
+        """Returns the progress of a waiting order, with no more than the number of the others."""
         running = self._running()
         if order_id[0] in running:
             return "waiting for other packages of your key"
@@ -373,10 +373,10 @@ class Packages:
 
 
 def checked(request: m.NeedPackages) -> dict[str, Any]:
-    """An order as plain values, within bounds; what they mean, the program looks at.
+    """Checks the types and bounds of an order's values; the program checks their meaning.
 
     Trust: input from a client.
-    Raises ``RefusedError``: it is none.
+    Raises ``RefusedError``: the value is no order.
     """
     rows: dict[str, tuple[tuple[Any, ...], int]] = {
         "requirements": (request.requirements, 2),

@@ -1,7 +1,8 @@
-"""Room for a client's sessions and jails, within the quotas of its key, and its end.
+"""Admits clients' sessions and jails within the quotas of their keys, and ends them.
 
-First come, first served, among the processes of one key. A session ends when nothing holds it any
-more; one whose process has gone also where its place is needed. A server that drains has no room.
+The processes of one key are served in the order in which they came. A session ends when nothing
+holds it any more; a session whose process has ended also ends when another needs its place. A
+draining server has no room.
 """
 
 from __future__ import annotations
@@ -37,10 +38,9 @@ class _Waiting:
 
 
 class Line:
-    """The order in which clients first asked, as long as they go on asking.
+    """Clients in the order of their first request, as long as they repeat it.
 
-    A client that has asked once may not mean to wait, and so delays no other; one that asks again
-    does.
+    A client that has asked only once may not want to wait, so it delays no other client.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -49,7 +49,7 @@ class Line:
 
     @property
     def waiting(self) -> int:
-        """How many clients wait: they have asked more than once, and lately."""
+        """Returns how many clients wait: those that have asked more than once, and recently."""
         now = self._clock()
         return sum(
             client.times > 1 and now - client.asked <= _PATIENCE_S
@@ -58,7 +58,7 @@ class Line:
         )
 
     def ahead(self, key: bytes, owner: bytes) -> int:
-        """How many clients that wait came before this one."""
+        """Returns how many waiting clients came before this one."""
         waiting, now = self._waiting.get(key, OrderedDict()), self._clock()
         for name, client in list(waiting.items()):
             if now - client.asked > _PATIENCE_S:
@@ -80,7 +80,7 @@ class Line:
             waiting[owner] = _Waiting(self._clock())
 
     def leave(self, key: bytes, owner: bytes) -> None:
-        """Remove a client that was let in."""
+        """Remove an admitted client."""
         waiting = self._waiting.get(key, OrderedDict())
         waiting.pop(owner, None)
         if not waiting:
@@ -88,11 +88,11 @@ class Line:
 
 
 class Places:
-    """Holds sessions and jails against the quotas, and ends those that clients have left.
+    """Checks sessions and jails against the quotas, and ends those that clients have left.
 
     Args:
-        idle_s: How long the jails of a client that says nothing live on; 0 for ever.
-        open_wires: The connections that are there now; None if they are not counted.
+        idle_s: How long the jails of a silent client live; 0 for ever.
+        open_wires: Returns the open connections; None if they are not counted.
 
     Attributes:
         lines: The clients that wait, by quota.
@@ -141,7 +141,7 @@ class Places:
                 break
             except BusyError:
                 self._disconnect()
-                # its own may look so, too: what it said last is read after it has gone
+                # The asker's own session may look abandoned, too: a message may outlive its sender.
                 sessions = self._sessions.of_key(key)
                 gone = longest_gone([other for other in sessions if other.owner != asker.session])
                 if gone is None:
@@ -155,9 +155,9 @@ class Places:
             self.lines["jails"].leave(key, asker.session)
 
     def for_slabs(self, asker: Asker, request: m.ShareSlabs) -> None:
-        """Hold slabs, of which some replace others, against the quota of memory.
+        """Check new slabs, some of which replace others, against the quota of memory.
 
-        Steps are possible without them: no session ends for slabs, and none waits in line.
+        Steps work without slabs, so no session ends or waits for them.
         """
         parts = [part for part in request.slabs if type(part) is tuple and len(part) == 4]
         replaced = {part[0] for part in parts if type(part[0]) is int}
@@ -206,10 +206,10 @@ class Places:
             self._jails.end(entry, "its client gave it up")
 
     def end_deserted(self) -> None:
-        """Forget the connections that have gone, and the sessions that have nothing else.
+        """Forget closed connections, and sessions without jails that had no other connection.
 
-        A client that is only cut off loses nothing: what it had was a name. One that has jails
-        keeps them, for ``idle_s``, or until others of its key need the place.
+        A client that was only cut off loses nothing but a name. If it has jails, it keeps them for
+        ``idle_s``, or until other clients of its key need the place.
         """
         self._disconnect()
         for session in self._sessions.all():
@@ -235,14 +235,14 @@ class Places:
 
 
 def longest_gone(sessions: Sequence[Session]) -> Session | None:
-    """The session without a connection that was heard from the longest ago, if there is one."""
+    """Returns the disconnected session that was silent for longest, if there is one."""
     gone = [session for session in sessions if not session.connections]
     return min(gone, key=attrgetter("heard"), default=None)
 
 
 class Drain:
-    """When a server was asked to end, and what that means for its clients.
-    ``drain_s``: how long what runs may go on; 0 waits for nothing.
+    """The state of a server that was asked to end.
+    ``drain_s``: how long open jails may go on; 0 does not wait.
     """
 
     def __init__(self, drain_s: float, clock: Callable[[], float] = time.monotonic) -> None:
@@ -265,7 +265,7 @@ class Drain:
         return True
 
     def quiet(self, busy: bool) -> bool:
-        """Whether the last jail ended a moment ago or earlier; ``busy``: one is open."""
+        """Whether no jail is open and clients had a moment to notice. ``busy``: a jail is open."""
         now = self._clock()
         if busy or self._quiet_since is None:
             self._quiet_since = None if busy else now

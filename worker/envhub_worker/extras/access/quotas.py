@@ -1,4 +1,4 @@
-"""What one client key may take of a server that many share, and what its policy may say."""
+"""The quotas of a client key on a shared server, and the policies that its jails may have."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RETRY_S = 1.0
 
 
 class BusyError(RefusedError):
-    """There is no room at present."""
+    """The server has no room at present."""
 
     def __init__(self, busy: Busy, message: str) -> None:
         super().__init__(BUSY_ERROR, message, busy.quota, busy.words())
@@ -29,16 +29,16 @@ class BusyError(RefusedError):
 
 @dataclass(frozen=True, kw_only=True)
 class Quotas:
-    """Of one client key, all its processes together.
+    """The quotas of one client key, for all its processes together.
 
     Attributes:
-        runners: Processes of environments in them.
+        runners: Runners in its jails.
         memory_bytes: The sum of its open jails' memory limits, and of the slabs that the server
             shares with them. ``processes``, ``open_files``, ``disk_bytes`` and ``disk_files`` are
             sums of their limits, too.
-        upload_bytes: Files of snapshots that it has brought here; the longest unused go first.
-        packages_bytes: Environments of its repositories' packages, and what was downloaded for
-            them; the longest unused go first.
+        upload_bytes: Uploaded files of its snapshots; the longest unused are removed first.
+        packages_bytes: Its repositories' packages with their downloads; the longest unused are
+            removed first.
         inflight_bytes: Requests that its jails have not answered yet.
         sessions: Processes of the client.
     """
@@ -59,7 +59,7 @@ class Quotas:
 
 @dataclass(frozen=True, kw_only=True)
 class Permissions:
-    """What a client's policy may ask of this host: its network, its GPU, a weaker profile.
+    """The rights that a client's policy may request: the network, GPUs, a weaker profile.
     ``dependencies``: whether packages that repositories declare are installed here.
     """
 
@@ -71,13 +71,13 @@ class Permissions:
 
 @dataclass(frozen=True, kw_only=True)
 class Rules:
-    """How a ``RemoteGate`` is set up.
+    """The configuration of a ``RemoteGate``.
 
     Attributes:
         keys: The server's key pair; None only for ``--insecure-loopback``.
-        operators: Keys that see everybody's sessions: the server's own.
-        idle_s: How long the jails of a client that says nothing live on.
-        drain_s: How long what runs may go on once nothing new is let in.
+        operators: Keys that may see all sessions: the server's own.
+        idle_s: How long the jails of a silent client live.
+        drain_s: How long open jails may go on after the drain has begun.
         profile: The strongest that jails can have here.
     """
 
@@ -102,13 +102,15 @@ Use = Mapping[str, int]
 
 
 def use_of(limits: Limits, runners: int, shared_bytes: int = 0) -> Use:
-    """What a jail with these limits takes; ``shared_bytes``: of slabs, which are the server's."""
+    """Returns a jail's share of the quotas; ``shared_bytes``: size of the slabs of its runners."""
     use = {"jails": 1, "runners": runners, **{name: getattr(limits, name) for name in _LIMITED}}
     return {**use, "memory_bytes": limits.memory_bytes + shared_bytes}
 
 
 def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permissions) -> None:
-    """Refuse what a client on another host cannot have. Raises ``RefusedError``."""
+    """Refuse a policy with rights that a client on another host may not have. Raises
+    ``RefusedError``.
+    """
     if "/" in request.runtime.packages:
         raise RefusedError(
             "PolicyError",
@@ -135,8 +137,8 @@ def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permi
 
 
 def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
-    """Refuse a jail, or further runners of one, above the quotas.
-    Raises ``RefusedError``: with the quota that it would break.
+    """Refuse a jail, or further runners, over the quotas.
+    Raises ``RefusedError`` with the exceeded quota.
     """
     uses = list(open_jails)
     for name, added in more.items():
@@ -157,13 +159,13 @@ def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
 
 @mutable_dataclass
 class InFlight:
-    """Bytes that clients have sent and that are not answered yet."""
+    """The bytes of unanswered requests, by key."""
 
     _of: Counter[bytes] = field(default_factory=Counter)
     _requests: dict[tuple[bytes, int], tuple[Asker, bytes, int]] = field(default_factory=dict)
 
     def of(self, key: bytes) -> int:
-        """Bytes in flight of a key."""
+        """Returns the bytes in flight of a key."""
         return self._of[key]
 
     def add(self, key: bytes, asker: Asker, size: int, quota: int) -> None:

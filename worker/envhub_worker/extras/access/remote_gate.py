@@ -1,4 +1,4 @@
-"""Keys, quotas and the snapshots that clients bring along: the gate before a TCP port."""
+"""The gate of a TCP port: checks clients' keys and quotas, and holds their snapshots."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from envhub_worker.supervisor.records import Asker, JailRecord, RefusedError
 
 
 class RemoteGate(Gate):
-    """Keys, quotas and the snapshots that clients bring along."""
+    """Checks clients' keys and quotas, and holds their snapshots."""
 
     compresses = True
 
@@ -87,20 +87,20 @@ class RemoteGate(Gate):
         return self._port.connections.open_wires()
 
     def receive(self, router: zmq.Socket[bytes]) -> Incoming:
-        """The key is the one that was proved in the handshake, never what the peer claims."""
+        """Receive a message; its key is the one proved in the handshake, not a peer's claim."""
         return self._port.receive(router)
 
     def _admits(self, key: bytes, address: str) -> bool:
         if self._is_known(key):
             return True
-        # a kind of its own: noise at the port must not count away the line that an operator needs
+        # An event of its own: noise at the port must not use up the lines that an operator needs.
         self._log.say("unknown_key", key=key_text(key), address=address)
         return False
 
     # --- requests ------------------------------------------------------------------------------
 
     def greet(self, arrived: Incoming, name: bytes) -> None:
-        """Refuse a sender without a key of ours, and more sessions than the quota."""
+        """Refuse a sender without an authorized key, and more sessions than the quota."""
         key = arrived.key
         self._refuse_unless_authorized(key)
         if len(name) > 64:
@@ -116,7 +116,7 @@ class RemoteGate(Gate):
             self._events.came(session)
 
     def authorize(self, asker: Asker, request: m.Message, payload: Payload) -> m.Message:
-        """Hold a request against keys and quotas."""
+        """Check a request against keys and quotas."""
         self._refuse_unless_authorized(asker.key)
         if isinstance(request, (m.OpenJail, m.OfferSnapshot, m.NeedPackages)):
             self._drain.refuse_new()
@@ -175,7 +175,7 @@ class RemoteGate(Gate):
         )
 
     def _hub_copies(self, key: bytes, request: m.OpenJail) -> tuple[object, ...]:
-        """The request's repositories with the paths of snapshots that this client has uploaded."""
+        """Returns the request's Hub copies with the paths of this client's uploaded snapshots."""
         try:
             trees = {copy.tree for copy in request.repositories if copy.tree}
         except ProtocolError as error:
@@ -213,7 +213,7 @@ class RemoteGate(Gate):
         return m.Sessions(tuple(self._sessions_of(asker.key)), self.figures(asker.key))
 
     def answered(self, asker: Asker, reply: m.Message) -> None:
-        """Take a request's bytes off those in flight; count and log a refusal."""
+        """Stop counting a request's bytes as in flight; count and log a refusal."""
         self._in_flight.answered(asker)
         if isinstance(reply, m.Refusal):
             self._tally.refused(reply.error, reply.missing)
@@ -223,7 +223,7 @@ class RemoteGate(Gate):
         return client_name(self._rules.authorized.name_of(key), self._rules.keys is None)
 
     def figures(self, key: bytes | None = None) -> dict[str, Any]:
-        """Figures of the server: all of them for an operator, else those of the key alone."""
+        """Returns the server's figures: all for an operator, else those of the key only."""
         clients = ClientFigures()
         sessions = [session for session in self.sessions.all() if session.name != WATCHER]
         watchers = [session for session in self.sessions.all() if session.name == WATCHER]
@@ -307,11 +307,11 @@ class RemoteGate(Gate):
         self._unread = why
 
     def drain(self) -> bool:
-        """Refuse new sessions and jails; those that run have ``drain_s``."""
+        """Refuse new sessions and jails; open ones may go on for ``drain_s``."""
         return self._drain.begin(self._log)
 
     def drained(self) -> bool:
-        """Whether the server may end: no jail is left, and clients had a moment to hear so."""
+        """Whether the server may end: no jail is open, and clients had a moment to notice."""
         return self._drain.left_s is not None and self._drain.quiet(bool(self.jails.open_ones()))
 
     def close(self) -> None:
@@ -324,5 +324,5 @@ class RemoteGate(Gate):
 
 
 def _key_of(entry: JailRecord) -> bytes:
-    """The key of the client that owns a jail: ``Session.owner`` begins with it."""
+    """Returns the key of a jail's client: ``Session.owner`` begins with it."""
     return entry.session[:KEY_BYTES]

@@ -1,1 +1,1 @@
-"""What an operator reads: lines of a log, and figures."""
+"""The operator's view of a server: a log and figures."""

@@ -1,8 +1,8 @@
-"""A server's figures: its operator sees all of them, a client what concerns it.
+"""A server's figures: its operator sees all of them, a client those about itself.
 
-Plain values, made on the server's own thread and never changed afterwards, so that another may read
-them. Clients go by name, and what is counted by a word of theirs has a fixed list of words. What
-jails take of the processor and of memory is looked at now and then (``Usage``).
+Figures are plain values that the server's thread makes and never changes afterwards, so that other
+threads may read them. Clients appear by name; counts by a client's word use a fixed list of words.
+``Usage`` samples the processor time and memory of jails.
 """
 
 from __future__ import annotations
@@ -53,17 +53,17 @@ class Tally:
     opened: Counter[str] = field(default_factory=Counter)
 
     def refused(self, error: str, quota: str) -> None:
-        """A request was not carried out; ``quota`` where that was for want of room."""
+        """Count a refused request; ``quota`` names the quota that had no room, if any."""
         word = quota if quota in REFUSALS else error
         self.refusals[word if word in REFUSALS else _OTHER] += 1
 
     def asked(self, client: str, operation: str) -> None:
-        """A client has asked something of its runners."""
+        """Count a client's request to its runners."""
         word = operation if operation in OPERATIONS else _OTHER
         self.requests.setdefault(self._known(client), Counter())[word] += 1
 
     def open(self, client: str) -> None:
-        """A client's jail has come up."""
+        """Count a started jail of a client."""
         self.opened[self._known(client)] += 1
 
     def _known(self, client: str) -> str:
@@ -72,7 +72,7 @@ class Tally:
 
 
 def facts_for_clients(rules: Rules) -> dict[str, Any]:
-    """What a client may know of a server."""
+    """Returns the facts about a server that a client may know."""
     return {
         "version": __version__,
         "protocol": m.VERSION,
@@ -84,7 +84,7 @@ def facts_for_clients(rules: Rules) -> dict[str, Any]:
 
 
 def facts_for_operators(rules: Rules, state: str) -> dict[str, Any]:
-    """Facts that only an operator gets. ``state``: the folder of keys and snapshots."""
+    """Returns the facts for an operator only. ``state``: the folder of keys and snapshots."""
     try:
         disk = shutil.disk_usage(state)
         size, free = disk.total, disk.free
@@ -99,7 +99,7 @@ def facts_for_operators(rules: Rules, state: str) -> dict[str, Any]:
 
 
 def pid_namespace() -> str:
-    """Where our process numbers hold; empty if the kernel does not say."""
+    """Returns the pid namespace of our pids; empty if the kernel does not tell."""
     with contextlib.suppress(OSError):
         return os.readlink("/proc/self/ns/pid")
     return ""
@@ -107,11 +107,11 @@ def pid_namespace() -> str:
 
 @dataclass(frozen=True)
 class Process:
-    """One look at a process.
+    """One measurement of a process.
 
     Attributes:
-        started: When it was started, so that the number is not taken for another's.
-        memory_bytes: Its share of what it has in memory; all of that where the share is not known.
+        started: Its start time, which tells it from a later process with the same pid.
+        memory_bytes: Its proportional share of memory; its whole memory if the share is unknown.
     """
 
     pid: int
@@ -121,14 +121,14 @@ class Process:
 
 
 class Usage:
-    """Memory, and processor time so far, of each client's jails.
+    """Measures the memory and total processor time of each client's jails.
 
-    A thread of its own looks: reading ``/proc`` of many processes takes milliseconds that no client
-    shall wait for. A process that came and went between two looks is not seen.
+    Its own thread measures: to read ``/proc`` of many processes takes milliseconds, for which no
+    client should wait. It misses processes that start and end between two measurements.
 
     Attributes:
-        memory_bytes: By client, at the last look; replaced, never changed.
-        cpu_s: By client, since the start; likewise.
+        memory_bytes: Memory by client at the last measurement; replaced, never changed.
+        cpu_s: Processor time by client since the start; replaced, never changed.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
@@ -141,7 +141,7 @@ class Usage:
         self._thread = threading.Thread(target=self._watch, name="envhub usage", daemon=True)
 
     def watch(self, jails: Mapping[int, str]) -> None:
-        """Set the jails to look at: their first pids, and their clients."""
+        """Set the jails to measure: their first pids, and their clients."""
         self._jails = jails
         if jails and self._thread.ident is None:
             self._thread.start()
@@ -154,7 +154,7 @@ class Usage:
                 self._failed(error)
 
     def look(self) -> None:
-        """Look once."""
+        """Measure once."""
         memory, spent = Counter[str](), dict(self.cpu_s)
         seen: dict[tuple[int, int], float] = {}
         for process, client in _members(self._jails):
@@ -166,12 +166,12 @@ class Usage:
         self.memory_bytes, self.cpu_s, self._seen = memory, spent, seen
 
     def close(self) -> None:
-        """Look no more."""
+        """Stop measuring."""
         self._stop.set()
 
 
 def _members(jails: Mapping[int, str]) -> Iterator[tuple[Process, str]]:
-    """All processes of the jails: the first of each, and its descendants."""
+    """Returns all processes of the jails: each jail's first process and its descendants."""
     children = procfs.all_children() if jails else {}
     for first, client in jails.items():
         for pid in (first, *procfs.descendants(first, children=children)):
@@ -181,7 +181,7 @@ def _members(jails: Mapping[int, str]) -> Iterator[tuple[Process, str]]:
 
 
 def look_at(pid: int) -> Process | None:
-    """A process as the kernel describes it, or None if it has gone."""
+    """Measures a process; returns None if it has ended."""
     try:
         words = procfs.stat(pid)
         spent = (int(words[_USER]) + int(words[_SYSTEM])) / _TICKS_A_S
@@ -193,7 +193,7 @@ def look_at(pid: int) -> Process | None:
 
 
 def _share(pid: int, resident: int) -> int:
-    """Proportional memory of a process: a shared page is divided among its owners."""
+    """Returns a process's proportional memory: a shared page is divided among its owners."""
     with contextlib.suppress(OSError):
         return procfs.numbers(f"/proc/{pid}/smaps_rollup").get(b"Pss", resident)
     return resident
@@ -201,7 +201,7 @@ def _share(pid: int, resident: int) -> int:
 
 @dataclass
 class Client:
-    """One client's share, of all its keys that have this name."""
+    """The figures of one client: of all keys with its name."""
 
     sessions: int = 0
     jails: int = 0
@@ -222,19 +222,19 @@ class Client:
 
 
 class ClientFigures:
-    """The shares of all clients, by name, and of no more names than can be counted."""
+    """The figures of all clients by name, for a bounded number of names."""
 
     def __init__(self) -> None:
         self.shares: dict[str, Client] = {}
 
     def of(self, name: str) -> Client:
-        """A client's share."""
+        """Returns a client's figures."""
         if name not in self.shares and len(self.shares) >= MAX_CLIENTS:
             name = OTHERS
         return self.shares.setdefault(name, Client())
 
     def add_past(self, tally: Tally, usage: Usage) -> None:
-        """Add what clients have done since the start, also in jails that have ended."""
+        """Add the clients' totals since the start, which include ended jails."""
         for name, requests in tally.requests.items():
             self.of(name).requests = dict(requests)
         for name, opened in tally.opened.items():
@@ -245,13 +245,13 @@ class ClientFigures:
             self.of(name).memory_bytes += memory
 
     def plain(self, name: str | None = None) -> Mapping[str, Any]:
-        """As plain values: of everybody, or of one."""
+        """Returns plain values of all clients, or of one client."""
         chosen = self.shares if name is None else {name: self.of(name)}
         return {client: asdict(share) for client, share in chosen.items()}
 
 
 def client_name(name: str | None, insecure: bool) -> str:
-    """What a key's owner is called in figures; the list that names it is the operator's."""
+    """Returns the name of a key's owner in figures, from the operator's list of clients."""
     if name is None:
         return "anybody" if insecure else "operator"
     return printable(" ".join(name[:_NAME_CHARS].split()))

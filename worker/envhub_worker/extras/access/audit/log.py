@@ -1,13 +1,13 @@
-"""What a server that many share writes down, in a log that cannot be filled.
+"""The log of a shared server, whose size senders cannot inflate.
 
-There are some lines a minute of each event, then a count. Strangers share a few lines, so that
-noise at the port leaves room for what an operator needs. Each client has many of its own, which
-ordinary work does not reach.
+Each event gets a few lines per minute, then a count. Strangers share a few lines, so that noise at
+the port leaves room for the lines that an operator needs. Each client has many lines of its own,
+more than ordinary work writes.
 
 One event is one line: for people, or as JSON for programs. Trust: names and reasons come from
-clients, from jails and from strangers at the port. What they hold is written in ASCII, with
-everything escaped that is no plain character, and cut where it is long: a sender can neither end a
-line and begin one of its own, nor reach the terminal that shows it.
+clients, from jails and from strangers at the port. Their text is written in ASCII, with every
+special character escaped, and long text is cut: a sender can neither forge a log line nor send
+escape sequences to a terminal.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def _time(when: float) -> str:
 
 
 def _bounded(name: str, value: object) -> bool | int | float | str:
-    """A number as it is, floats rounded; else text, cut to its limit."""
+    """Returns a number, rounded if it is a float; any other value as text, cut to its limit."""
     if isinstance(value, float):
         return round(value, 3)
     if isinstance(value, (bool, int)):
@@ -111,7 +111,7 @@ class Log:
         self._counts: Counter[tuple[str, str]] = Counter()
 
     def say(self, event: str, level: str = "warning", *, whose: str = "", **fields: object) -> None:
-        """Write a line, or count it as left out. ``whose``: the client's key, if there is one."""
+        """Write a line, or count it as omitted. ``whose``: the client's key, if there is one."""
         if LEVELS.index(level) < self._least:
             return
         self.tick()
@@ -120,7 +120,7 @@ class Log:
             self._line(level, event, **fields)
 
     def tick(self) -> None:
-        """When a period is over, say how much was left out."""
+        """At the end of a period, write how many lines were omitted."""
         if self._clock() - self._since < PERIOD_S:
             return
         for (event, whose), count in self._counts.items():
@@ -139,11 +139,11 @@ def _most(whose: str) -> int:
 
 
 class Events(Witness):
-    """A line an event of clients and their jails, under the name that the operator has given.
+    """Logs events of clients and their jails, under the names in the operator's list.
 
     Args:
-        name_of: The name that stands beside a key in the list of clients.
-        count_opened: Called with the key whose jail has come up.
+        name_of: Returns the name of a key in the list of clients.
+        count_opened: Called with a client's key when its jail has started.
     """
 
     def __init__(
@@ -160,25 +160,25 @@ class Events(Witness):
     # --- clients -------------------------------------------------------------------------------
 
     def came(self, session: Session) -> None:
-        """A client's process has said Hello for the first time."""
+        """Log the first ``Hello`` of a client's process."""
         self._in_line.discard((session.key, "sessions"))
         level = "debug" if session.name == WATCHER else "info"
         self._client(session.owner, "client_connected", level, key=key_text(session.key))
 
     def left(self, session: Session, why: str) -> None:
-        """Its session is forgotten."""
+        """Log the end of a session."""
         self._in_line -= {entry for entry in self._in_line if entry[0] == session.owner}
         level = "debug" if session.name == WATCHER else "info"
         seconds = monotonic() - session.since
         self._client(session.owner, "client_left", level, why=why, seconds=seconds)
 
     def uploads(self, owner: bytes, snapshot: str, files: int, size: int) -> None:
-        """A client is to bring so many files and bytes, which the server lacks of a snapshot."""
+        """Log how many files and bytes of a snapshot a client has to upload."""
         fields = {"snapshot": snapshot, "files": files, "bytes": size}
         self._client(owner, "upload", "info", **fields)
 
     def packages(self, owner: bytes, seconds: float, result: Mapping[str, Any]) -> None:
-        """The program that makes packages has ended; what it says quotes a client."""
+        """Log the end of the program that makes packages; its text quotes a client."""
         environment = result.get("made")
         fields = {name: environment[name] for name in ("name", "bytes")} if environment else {}
         if "error" in result:
@@ -187,7 +187,7 @@ class Events(Witness):
         self._client(owner, "packages", level, seconds=seconds, **fields)
 
     def refused(self, asker: Asker, refused: m.Refusal) -> None:
-        """A request was refused. A client in line asks each second: that is logged once."""
+        """Log a refusal. A waiting client asks every second; only its first refusal is logged."""
         owner, level = asker.session or asker.key, "warning"
         fields: dict[str, object] = {"error": refused.error, "why": refused.message}
         if busy := refused.busy:
@@ -203,7 +203,7 @@ class Events(Witness):
     # --- jails ---------------------------------------------------------------------------------
 
     def opened(self, entry: JailRecord, runners: int, seconds: float) -> None:
-        """A jail has come up, or further runners in it."""
+        """Log the start of a jail or of further runners."""
         spec = entry.jail.spec
         self._in_line -= {line for line in self._in_line if line[0] == entry.session}
         fields = {**_jail(entry), "runners": runners, "seconds": seconds}
@@ -220,24 +220,24 @@ class Events(Witness):
         self._client(entry.session, "jail_opened", "info", **fields)
 
     def lost(self, entry: JailRecord, death: m.Death) -> None:
-        """A runner has died in a jail that goes on."""
+        """Log the death of a runner whose jail goes on."""
         fields = {**_jail(entry), "environment": entry.name, "runner": death.runner, **_how(death)}
         self._client(entry.session, "runner_died", "warning", **fields)
 
     def died(self, entry: JailRecord) -> None:
-        """A jail is dead; where it could not be made, its refusal says so."""
+        """Log a jail's death. A jail that could not be made is logged by its refusal."""
         refused = entry.death is not None and entry.death.reason == "unavailable"
         if entry.death is not None and (entry.opened or not refused):
             fields = {**_jail(entry), "environment": entry.name, **_how(entry.death), **_use(entry)}
             self._client(entry.session, "jail_died", "warning", **fields)
 
     def closed(self, entry: JailRecord) -> None:
-        """Nothing is left of a jail that its client has closed, or that the server ends with."""
+        """Log the end of a jail that its client or the server has closed."""
         fields = {**_jail(entry), "environment": entry.name, **_use(entry)}
         self._client(entry.session, "jail_closed", "info", **fields)
 
     def failed(self, error: Exception) -> None:
-        """An error of the server itself. No traceback if only this machine ran out of something."""
+        """Log an error of the server itself; without traceback if this machine lacks a resource."""
         short = shortage(error, "here")
         if short:
             self._log.say("out_of_resources", "error", why=short)
@@ -254,7 +254,7 @@ class Events(Witness):
 
 
 def session_id(owner: bytes) -> str:
-    """As ``envhub-worker status`` has it; a client chooses it."""
+    """Returns a session's id as in ``envhub-worker status``; the client has chosen it."""
     return owner[KEY_BYTES:].hex()[:8]
 
 
@@ -263,7 +263,7 @@ def _jail(entry: JailRecord) -> dict[str, object]:
 
 
 def _how(death: m.Death) -> dict[str, object]:
-    """How a jail died. Trust: the detail may quote the jail."""
+    """Returns the fields of a jail's death. Trust: the detail may quote the jail."""
     fields = {
         "reason": death.reason,
         "signal": death.signal,
@@ -274,6 +274,6 @@ def _how(death: m.Death) -> dict[str, object]:
 
 
 def _use(entry: JailRecord) -> dict[str, object]:
-    """How long a jail lived, and its bytes over the server: shared memory is not counted."""
+    """Returns a jail's lifetime and its bytes through the server, without shared memory."""
     sent, received = entry.bytes_moved()
     return {"seconds": monotonic() - entry.since, "bytes_in": sent, "bytes_out": received}

@@ -1,1 +1,1 @@
-"""Commands of ``envhub-worker``, one file each, and what ``listen`` needs besides."""
+"""Commands of ``envhub-worker``, one module each, and helpers of ``listen``."""

@@ -1,6 +1,6 @@
 """``envhub-worker drain``: end the ``listen`` of this state folder gently, and wait until it has.
 
-It sends SIGTERM: for how long open jails go on is the server's own ``--drain-s``.
+It sends SIGTERM. The server's option ``--drain-s`` says how long open jails go on.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _server(chosen: Path | None) -> tuple[int, bool]:
-    """A pidfd of the server that listens, and whether it drains. Its key proves its answers."""
+    """Returns a pidfd of the server, and whether it drains. The server's key proves its answers."""
     address = status.address_here(chosen)
     if address[1] is None:
         raise status.UnreachableError(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from envhub_worker.extras.access.commands.status import status_is_healthy
 
-# ZMTP 3: how both sides begin, unasked, before any key is needed (https://rfc.zeromq.org/spec/23).
+# The greeting of ZMTP 3: both sides send it before any key (https://rfc.zeromq.org/spec/23).
 _GREETING = b"\xff"
 _WAIT_S = 5.0
 
@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def answers(host: str, port: int) -> bool:
-    """Whether a ZeroMQ peer greets us there."""
+    """Whether a ZeroMQ peer at the address sends its greeting."""
     try:
         with socket.create_connection((host, port), _WAIT_S) as connection:
             greeting = connection.recv(1)

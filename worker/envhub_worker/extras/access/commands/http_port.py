@@ -1,8 +1,7 @@
 """A port that answers GET, for monitoring: small, slow and bounded.
 
-Who sends much, sends slowly or comes in crowds gets little: a request has a size and a time, and a
-newcomer takes the place of the connection that has been there the longest. Nothing of it touches
-the server's own loop.
+It resists floods and slow clients: size and time of a request are limited, and a new connection
+replaces the oldest one if there are too many. It never blocks the server's own loop.
 """
 
 from __future__ import annotations
@@ -31,10 +30,10 @@ Reply = tuple[int, str, bytes]
 
 
 class HttpPort(ThreadingTCPServer):
-    """Listens until it is closed; on any port that is free if that is 0.
+    """Listens until it is closed; port 0 means any free port.
 
-    ``answer`` gives the page of a path; what it raises is a 500, and ``failed`` gets the traceback.
-    Raises ``OSError``: the address is not to be had.
+    ``answer`` returns the page of a path; its error is answered by 500, and ``failed`` gets the
+    traceback. Raises ``OSError``: the address is not available.
     """
 
     allow_reuse_address = True
@@ -64,7 +63,7 @@ class HttpPort(ThreadingTCPServer):
         return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
     def close(self) -> None:
-        """Stop listening, and drop who is there."""
+        """Stop listening, and drop all connections."""
         self.shutdown()
         self.server_close()
         with self._lock:
@@ -100,7 +99,7 @@ class HttpPort(ThreadingTCPServer):
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore errors of a connection: its peer is too slow, or has gone."""
+        """Ignore errors of a connection: its peer is too slow or has closed it."""
 
     def reply(self, asked: bytes) -> bytes:
         """The answer to a whole request."""
@@ -152,8 +151,8 @@ def _bytes(status: int, kind: str, body: bytes, *, head: bool = False) -> bytes:
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """``PORT``, ``HOST:PORT`` or ``[HOST]:PORT``; without a host it is 127.0.0.1.
-    Raises ``ValueError``: it is none; the text says what it takes.
+    """Parses ``PORT``, ``HOST:PORT`` or ``[HOST]:PORT``; the default host is 127.0.0.1.
+    Raises ``ValueError``: the text is no address; the error lists the forms.
     """
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]") or "127.0.0.1"

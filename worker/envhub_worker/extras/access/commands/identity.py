@@ -1,4 +1,4 @@
-"""The identity of a ``listen``: its address, its keys, whose keys may come in, its announcement."""
+"""The identity of a ``listen``: its address, its keys, its clients' keys, its announcement."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class UsageError(Exception):
 
 @dataclass(frozen=True)
 class Identity:
-    """Who the server is, and who may come in.
+    """The server's keys and its clients.
 
     Attributes:
-        keys: The server's pair; None only behind ``--insecure-loopback``.
-        client: The one client that was named, or made if there is no such file.
-        fresh: Whether that was made just now.
+        keys: The server's key pair; None only with ``--insecure-loopback``.
+        client: The only client, named by an option or made because there is no list of clients.
+        fresh: Whether that client's key was made just now.
         profile: The strongest profile that jails can have here.
     """
 
@@ -46,7 +46,7 @@ class Identity:
 
 
 def identity_of(arguments: argparse.Namespace, state: Path) -> Identity:
-    """The identity by the arguments, with the state folder's keys if they name none."""
+    """Returns the identity by the arguments; without keys in them, by the state folder's."""
     if arguments.insecure_loopback:
         if arguments.key or arguments.authorized_clients or arguments.only_client:
             raise UsageError(
@@ -66,7 +66,7 @@ def identity_of(arguments: argparse.Namespace, state: Path) -> Identity:
 
 
 def _kept_pair(state: Path, name: str) -> tuple[KeyPair, bool]:
-    """The pair in the state folder, and whether it was made just now."""
+    """Returns the key pair of the state folder, and whether it was made just now."""
     with contextlib.suppress(FileNotFoundError):
         return keys.load(state / f"{name}.key"), False
     pair = keys.generate()
@@ -76,7 +76,7 @@ def _kept_pair(state: Path, name: str) -> tuple[KeyPair, bool]:
 
 
 def announcement(endpoint: str, identity: Identity) -> str:
-    """What is printed at the start: the endpoint, the public key, and what a client writes."""
+    """Returns the text to print at the start: endpoint, public key, and a client's ``make_env``."""
     lines = [f"envhub-worker {__version__} listens on {endpoint}"]
     reached = reachable(endpoint)
     policy = "" if identity.profile == "strict" else f", policy={{'profile': {identity.profile!r}}}"
@@ -113,7 +113,7 @@ def announcement(endpoint: str, identity: Identity) -> str:
 
 
 def unusable(strongest: str, weakest: str) -> str:
-    """A warning if this host cannot run a jail of any permitted profile; else empty."""
+    """Returns a warning if this host cannot run a jail of any permitted profile; else empty."""
     if PROFILES.index(strongest) <= PROFILES.index(weakest):
         return ""
     return (
@@ -123,13 +123,13 @@ def unusable(strongest: str, weakest: str) -> str:
 
 
 def reachable(endpoint: str) -> str:
-    """An endpoint that a client on this machine can connect to."""
+    """Returns an endpoint that a client on this machine can connect to."""
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
     return f"tcp://127.0.0.1:{port}" if host in _ANY_HOST else endpoint
 
 
 def check_bind(endpoint: str, insecure: bool) -> None:
-    """Refuse what is no TCP address, and a loopback that is none. Raises ``UsageError``."""
+    """Raises ``UsageError`` unless the address is TCP, and loopback if it must be."""
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
     a_port = port == "*" or (port.isdigit() and int(port) <= 65_535)
     if not endpoint.startswith("tcp://") or not host or not a_port:
@@ -142,7 +142,7 @@ def check_bind(endpoint: str, insecure: bool) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether it is an address of this machine alone."""
+    """Whether only this machine can reach an address."""
     try:
         return ipaddress.ip_address(host.strip("[]")).is_loopback
     except ValueError:

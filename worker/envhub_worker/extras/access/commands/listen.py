@@ -1,8 +1,8 @@
 """``envhub-worker listen``: a worker server for clients on other hosts.
 
-It listens without keys only with --insecure-loopback and on a loopback address, and on all
-interfaces only where --bind names them. Without ``--authorized-clients`` it makes a key for one
-client and prints it: no other client comes in.
+It listens without keys only with --insecure-loopback on a loopback address, and on all interfaces
+only if --bind names them. Without ``--authorized-clients`` it makes a key for one client and prints
+it; no other client may connect.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def _serve(
 def _announce(
     arguments: argparse.Namespace, identity: Identity, endpoint: str, around: Surroundings | None
 ) -> None:
-    """Say where it listens, in the way that whoever started it reads."""
+    """Announce the address in the form that the starting program reads."""
     if arguments.ready_fd is not None:
         with contextlib.suppress(BrokenPipeError):  # who started us has gone: the loop sees it
             os.write(arguments.ready_fd, f"{endpoint} {identity.public}\n".encode())
@@ -145,8 +145,8 @@ def _announce(
 
 @contextmanager
 def _watched(metrics: str | None, log: Log, *, usable: bool) -> Iterator[Publish | None]:
-    """Open the port for monitoring, if one is wanted; yields the function that takes figures.
-    Raises ``UsageError``: it cannot be opened; the text says why.
+    """Opens the port for monitoring, if there is one; yields the function that publishes figures.
+    Raises ``UsageError``: the port cannot be opened.
     """
     if metrics is None:
         yield None
@@ -177,7 +177,7 @@ def _watched(metrics: str | None, log: Log, *, usable: bool) -> Iterator[Publish
 
 
 def most_connections(wanted: int) -> int:
-    """Half of our descriptors at most: the other half is for jails."""
+    """Returns the maximum of connections: half of our descriptors, the other half is for jails."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return wanted if soft == resource.RLIM_INFINITY else max(1, min(wanted, soft // 2))
 

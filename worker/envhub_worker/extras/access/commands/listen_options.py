@@ -20,7 +20,7 @@ from envhub_worker.protocol.text import parse_size, size_text
 DEFAULT_BIND = "tcp://127.0.0.1:5555"
 _IDLE_S = 120
 _CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv")
-# field of Quotas: the option's names, what it counts, and the unit of a bare number of bytes
+# Field of Quotas: the option's names, the counted resource, and the unit of a bare number.
 _QUOTAS: dict[str, tuple[tuple[str, ...], str, str]] = {
     "jails": (("--max-jails",), "open jails", ""),
     "runners": (("--max-runners", "--max-hosts"), "processes of environments", ""),
@@ -150,7 +150,7 @@ def _add_quotas(parser: argparse.ArgumentParser) -> None:
 
 
 def quotas_of(arguments: argparse.Namespace) -> Quotas:
-    """The quotas that were chosen."""
+    """Returns the quotas that the options choose."""
     given = vars(arguments)
     return Quotas(
         **{
@@ -188,9 +188,9 @@ _count, _seconds = partial(_at_least, 1), partial(_at_least, 0)
 
 
 def _weakest_profile() -> str:
-    """``container`` in a container, which is a layer itself and often forbids the others.
+    """Returns ``container`` in a container, which is a layer itself and often forbids the others.
 
-    A jail of that profile runs as our user: without Landlock it would read our keys and stores.
+    A jail of that profile runs as our user, so it needs Landlock, which hides our keys and stores.
     """
     contained = any(map(os.path.exists, _CONTAINER_MARKS)) and landlock.version() >= 1
     return "container" if contained else "strict"

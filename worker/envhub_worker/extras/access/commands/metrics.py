@@ -1,7 +1,7 @@
-"""``listen --metrics``: the server's figures as Prometheus reads them, and whether it is well.
+"""``listen --metrics``: the server's figures in Prometheus's format, and its health.
 
-The figures are what the server's own thread published last: to ask here, however often, costs that
-thread nothing. Needs prometheus_client, for the text; that is the extra ``metrics``.
+The server's own thread publishes figures from time to time; requests read the last ones and cost
+that thread nothing. Needs prometheus_client (the extra ``metrics``) for the text.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _TEXT = "text/plain; charset=utf-8"
 
 
 class MetricsPage:
-    """What there is to read. ``render``: makes text of figures, and says of which kind."""
+    """The pages of the port. ``render``: returns figures as text, with the content type."""
 
     def __init__(
         self,
@@ -43,7 +43,7 @@ class MetricsPage:
         self._published = self._clock(), {**figures, "ready": self._usable and not _drains(figures)}
 
     def answer(self, path: str) -> Reply:
-        """The page of that path."""
+        """Returns the page of a path."""
         if path not in ("/metrics", "/healthz", "/readyz"):
             return 404, _TEXT, b"/metrics, /healthz, /readyz\n"
         published = self._published  # another thread replaces it
@@ -166,7 +166,7 @@ def _family(
 
 
 def exposition() -> Callable[[Mapping[str, Any]], tuple[str, bytes]]:
-    """A function that renders figures as text. Raises ``ImportError``."""
+    """Returns a function that renders figures as text. Raises ``ImportError``."""
     try:
         from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector
         from prometheus_client.exposition import generate_latest

@@ -1,7 +1,7 @@
-"""The folder with a ``listen``'s keys and snapshots, and its note for the commands of its machine.
+"""The folder with a ``listen``'s keys and snapshots, and its note for commands on its machine.
 
-The note is locked for as long as the server lives: one that is ended by SIGKILL leaves the file
-behind, but the kernel takes the lock back.
+The server holds a lock on the note for life: a server that SIGKILL ends leaves the file behind, but
+the kernel releases the lock.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _NAME = "endpoint"
 
 @contextlib.contextmanager
 def state_folder(chosen: Path | None) -> Iterator[Path]:
-    """The state folder; one that cannot be found again is removed."""
+    """A context with the state folder; removes a temporary one that no later server would find."""
     folder = state_dir(chosen, create=True)
     if folder is not None:
         yield folder
@@ -35,11 +35,11 @@ def state_folder(chosen: Path | None) -> Iterator[Path]:
 
 
 def state_dir(chosen: Path | None, *, create: bool) -> Path | None:
-    """Where keys and snapshots lie: the same for ``listen``, ``health`` and ``status``.
+    """Returns the folder of keys and snapshots, the same for ``listen``, ``health`` and ``status``.
 
-    ``chosen``, or ``envhub-worker`` in the user's state folder, or a folder of the temporary one
-    where that cannot be written (a read-only container); None if not even that can be had.
-    Raises ``OSError``: ``chosen`` cannot be had.
+    It is ``chosen``, else ``envhub-worker`` in the user's state folder, else, if that is not
+    writable (a read-only container), a temporary folder; None if that fails, too.
+    Raises ``OSError``: ``chosen`` cannot be used.
     """
     if chosen is not None:
         if create:
@@ -71,7 +71,7 @@ def _make_private(folder: Path) -> None:
 
 
 def _is_ours(folder: Path) -> bool:
-    """Whether the folder is ours and only we can write it: others can put one in ``/tmp``.
+    """Whether a folder is ours and only we can write it: others may have made it in ``/tmp``.
 
     A folder of ours that we cannot write is a read-only container's, and no server uses it.
     """
@@ -81,7 +81,7 @@ def _is_ours(folder: Path) -> bool:
 
 
 class ServerNote(NamedTuple):
-    """Where a server listens, its public key as text or ``insecure``, its secret key's file."""
+    """A server's endpoint, its public key as text or ``insecure``, its secret key's file."""
 
     endpoint: str
     public: str
@@ -101,7 +101,7 @@ class Note:
         os.rename(new, self._path)  # whole and locked, or not there
 
     def remove(self) -> None:
-        """Remove it, unless it is another server's by now."""
+        """Remove the note, unless another server has replaced it."""
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(self._path.stat(), os.fstat(self._file)):
                 self._path.unlink()
@@ -109,8 +109,8 @@ class Note:
 
 
 def read_note(state: Path) -> ServerNote | None:
-    """What the server that runs on a state folder has written down; None if there is none.
-    Raises ``OSError``: it may not be read; ``ValueError``: something else lies there.
+    """Reads the note of the server that runs on a state folder; None without a server.
+    Raises ``OSError``: the note is not readable; ``ValueError``: the file is no note.
     """
     try:
         file = os.open(state / _NAME, os.O_RDONLY | os.O_CLOEXEC)

@@ -24,7 +24,7 @@ _Reply = TypeVar("_Reply", bound=m.Message)
 
 
 class UnreachableError(Exception):
-    """There is no server, or it does not answer us."""
+    """No server runs, or it does not answer us."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _address(arguments: argparse.Namespace) -> tuple[str, bytes | None, keys.KeyPair]:
-    """The endpoint, the server's public key, and our own key pair."""
+    """Returns the endpoint, the server's public key, and our own key pair."""
     if arguments.endpoint:
         if not arguments.server_key or not arguments.key:
             raise ValueError("--endpoint needs --server-key and --key")
@@ -60,7 +60,7 @@ def _address(arguments: argparse.Namespace) -> tuple[str, bytes | None, keys.Key
 
 
 def address_here(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair]:
-    """The same, of the server that runs here on that state folder. Raises ``UnreachableError``."""
+    """Returns the address of the server on a state folder here. Raises ``UnreachableError``."""
     noted = _noted(chosen)
     if noted is None:
         raise UnreachableError("no 'envhub-worker listen' of this user is running here")
@@ -68,7 +68,7 @@ def address_here(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair]:
 
 
 def _noted(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair] | None:
-    """What a server of this user wrote down when it started; None if there is none."""
+    """Reads the note of this user's server; None if there is none."""
     state = state_dir(chosen, create=False)
     noted = None if state is None else read_note(state)
     if noted is None:
@@ -79,7 +79,7 @@ def _noted(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair] | None
 
 
 def status_is_healthy(chosen: Path | None) -> bool | None:
-    """Whether the server of this user answers requests; None if none was started here."""
+    """Whether this user's server answers requests; None if there is none here."""
     try:
         noted = _noted(chosen)
         if noted is not None:
@@ -92,7 +92,7 @@ def status_is_healthy(chosen: Path | None) -> bool | None:
 def _ask(
     endpoint: str, server_key: bytes | None, pair: keys.KeyPair
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """The sessions, and what the server says about itself."""
+    """Asks a server; returns its sessions and the facts about itself."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.IPV6, "[" in endpoint)
@@ -108,7 +108,7 @@ def _ask(
 
 
 def of_server(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> dict[str, Any]:
-    """What the server says about itself to its operator. Raises ``UnreachableError``."""
+    """Returns a server's facts for its operator. Raises ``UnreachableError``."""
     server = _ask(endpoint, server_key, pair)[1]
     if "pid_namespace" not in server:
         raise UnreachableError("the server does not know this key as its operator's")
@@ -130,7 +130,7 @@ def _request(
 
 
 def head(server: dict[str, Any]) -> str:
-    """The server itself, in a line or two."""
+    """Returns a line or two about the server itself."""
     lines = [
         f"envhub-worker {server['version']}, protocol {server['protocol']}, profile "
         f"{server['profile']} at most"
@@ -148,7 +148,7 @@ def head(server: dict[str, Any]) -> str:
 
 
 def table(sessions: list[dict[str, Any]]) -> str:
-    """Sessions and their jails, one line each."""
+    """Returns the sessions and their jails, one line each."""
     lines = [counted(len(sessions), "session")]
     for session in sessions:
         lines.append(

@@ -1,1 +1,1 @@
-"""Snapshots that clients bring along, by content."""
+"""Clients' uploaded snapshots, stored by content."""

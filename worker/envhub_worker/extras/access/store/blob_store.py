@@ -1,4 +1,4 @@
-"""One client key's files on disk, and a running total of what they are charged.
+"""One client key's files on disk, with a running total of their charge to the quota.
 
 Several servers of one machine may use a folder (``SharedUse``).
 """
@@ -38,12 +38,12 @@ class ListedFile:
 
 
 def blob_charge(size: int) -> int:
-    """Bytes that a file is charged."""
+    """Returns the bytes that a file counts for."""
     return max(size, BLOCK_BYTES)
 
 
 def tree_charge(paths: Iterable[str]) -> int:
-    """Bytes that a tree of links to files is charged: a block for each of its entries."""
+    """Returns the bytes that a tree of links counts for: a block for each entry."""
     entries, before = 0, list[str]()
     for steps in sorted(path.split("/") for path in paths):
         entries += len(steps) - sum(takewhile(bool, map(operator.eq, before, steps)))
@@ -52,7 +52,7 @@ def tree_charge(paths: Iterable[str]) -> int:
 
 
 class BlobStore:
-    """The files of one key. ``held``: bytes that they are charged."""
+    """The files of one key. ``held``: the bytes that they count for."""
 
     def __init__(self, home: Path) -> None:
         self.home = home
@@ -70,15 +70,15 @@ class BlobStore:
         return len(self._trees)
 
     def blob(self, sha256: bytes) -> Path:
-        """The path of a file, whether or not it is there."""
+        """Returns the path of a file, which need not exist."""
         return self.home / "blobs" / sha256.hex()
 
     def tree(self, digest: str) -> Path:
-        """The path of a snapshot, whether or not it is there."""
+        """Returns the path of a snapshot, which need not exist."""
         return self.home / "trees" / digest
 
     def has_all(self, digest: str, files: Collection[ListedFile]) -> bool:
-        """Whether a snapshot is there with all of its files."""
+        """Whether a snapshot exists with all of its files."""
         return all(_is_there(self.tree(digest) / file.path, file.size) for file in files)
 
     def set_aside(self, digest: str) -> None:
@@ -93,7 +93,7 @@ class BlobStore:
         self.held -= self._trees.pop(digest, 0)
 
     def take(self, part: Path, sha256: bytes, size: int) -> None:
-        """A file has arrived whole."""
+        """Add a completely uploaded file."""
         part.chmod(0o444)
         blob = self.blob(sha256)
         blob.parent.mkdir(mode=0o700, exist_ok=True)
@@ -102,7 +102,7 @@ class BlobStore:
         self._blobs[blob.name] = blob_charge(size)
 
     def unused(self, in_use: Collection[str]) -> list[str]:
-        """Digests of the trees that are not in use, the longest unused first."""
+        """Returns the digests of the trees that are not in use, the longest unused first."""
         real = os.path.realpath(self.home / "trees")
         used = {os.path.realpath(path) for path in in_use}
         names = [name for name in self._trees if os.path.join(real, name) not in used]
@@ -123,7 +123,7 @@ class BlobStore:
                     self.held -= self._blobs.pop(item.name, 0)
 
     def lay_out(self, digest: str, files: list[ListedFile], copying: Callable[[int], None]) -> None:
-        """Build a tree beside its place and rename it: what bears a digest is complete.
+        """Build a tree under a temporary name, then rename it: a digest names complete trees only.
 
         ``copying`` is called with the size of each file that cannot be a link, before it is copied.
         """
@@ -192,14 +192,14 @@ def _charge_on_disk(tree: Path) -> int:
 
 
 class SharedUse:
-    """This server's share of a folder's lock. The kernel gives it back when the server ends."""
+    """This server's shared lock on a folder. The kernel releases it when the server ends."""
 
     def __init__(self, path: Path) -> None:
         self._file = open(path, "a")  # noqa: SIM115, it goes with this object
 
     @contextlib.contextmanager
     def alone(self) -> Iterator[bool]:
-        """A context that says whether no other server uses the folder, and keeps it so.
+        """A context that yields whether no other server uses the folder, and keeps others out.
 
         False on a file system without locks.
         """

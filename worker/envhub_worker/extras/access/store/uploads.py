@@ -1,15 +1,16 @@
-"""Uploads of snapshots: the listing is checked, files arrive in pieces, a tree is made of them.
+"""Uploads of snapshots: checks the listing, receives files in pieces, makes a tree of them.
 
 ::
 
     <folder>/<key>/blobs/<sha256>       files, 0444, hashed when they arrived
     <folder>/<key>/trees/<digest>/      snapshots: hard links to them, in folders 0555
 
-Each client key has a store of its own: else a client that knows another's hashes would see its
-files. A snapshot is named by the digest of its listing, so the same listing is the same tree.
+Each client key has a store of its own: otherwise a client that knows the hashes of another client's
+files could read them. The name of a snapshot is the digest of its listing, so equal listings have
+one tree.
 
-A store may be shared with other servers of this machine, where all their clients are one user's:
-then what one has brought is there for all, and only a server that is alone removes anything.
+Servers of this machine may share a store if all their clients belong to one user: then each client
+can use all uploads, and only a server without others removes files.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ _MAX_NAME_BYTES = 255
 
 @dataclass
 class Partial:
-    """A file that is on its way."""
+    """A partly uploaded file."""
 
     path: Path
     size: int
@@ -68,12 +69,12 @@ class Partial:
 
 @dataclass
 class Offer:
-    """What a session is about to bring.
+    """A snapshot that a session is about to upload.
 
     Attributes:
-        needed: The hashes of all its files: they stay until its tree is laid out.
-        missing: Of these, the ones that are not here yet, with their sizes.
-        reserved: What it may still be charged.
+        needed: The hashes of all its files, which stay until its tree is laid out.
+        missing: The hashes among them that are not uploaded yet, with sizes.
+        reserved: Bytes reserved for it in the quota.
     """
 
     store: BlobStore
@@ -98,13 +99,13 @@ class Uploads:
             if alone:
                 for left in [*folder.glob("*/parts"), *folder.glob("*/trees/.building-*")]:
                     remove_tree(str(left))
-        # counted now: later everybody would wait for it
+        # Counted now, at the start: later all clients would wait for it.
         self._stores = {home.name: BlobStore(home) for home in folder.iterdir() if home.is_dir()}
 
     def offer(
         self, owner: bytes, key: bytes, request: m.OfferSnapshot, in_use: Collection[str]
     ) -> m.MissingBlobs:
-        """What is missing of a snapshot. Nothing: it lies ready.
+        """Returns the missing hashes of a snapshot; none if it is complete.
         ``in_use``: trees that must stay, by path.
         Raises ``RefusedError``: a listing that breaks a rule or the quota.
         """
@@ -202,7 +203,7 @@ class Uploads:
                 self._give_up(owner, sha256)
 
     def tree(self, key: bytes, snapshot: str) -> str:
-        """The path of a client's snapshot. Raises ``RefusedError`` where it is not here."""
+        """Returns the path of a client's snapshot. Raises ``RefusedError``: it is not uploaded."""
         if _SNAPSHOT.fullmatch(snapshot):
             tree = self._store(key).tree(snapshot.removeprefix(PREFIX))
             if tree.is_dir():
@@ -210,11 +211,11 @@ class Uploads:
         raise RefusedError("WorkerError", "this server has no such snapshot; offer it first")
 
     def used_bytes(self, key: bytes) -> int:
-        """What a client's files are charged, and what it has offered to bring."""
+        """Returns the bytes of a client's files, offered ones included, in the quota."""
         return self._charged(self._store(key))
 
     def _alone(self) -> contextlib.AbstractContextManager[bool]:
-        """A context that says whether no other server uses the folder, and keeps it so."""
+        """A context that yields whether no other server uses the folder, and keeps others out."""
         return contextlib.nullcontext(True) if self._use is None else self._use.alone()
 
     def _store(self, key: bytes) -> BlobStore:
@@ -230,7 +231,7 @@ class Uploads:
         return store.held + sum(offer.reserved for offer in self._offered(store))
 
     def _make_room(self, store: BlobStore, in_use: Collection[str]) -> None:
-        """Remove the longest unused snapshots until all that is offered fits, whole."""
+        """Remove the longest unused snapshots until the whole offer fits."""
         if self._fits(store):
             return
         with self._alone() as alone:
@@ -260,10 +261,10 @@ class Uploads:
 
 
 def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[ListedFile]:
-    """A listing whose every entry keeps the rules, sorted by path.
+    """Checks every entry of a listing; returns it sorted by path.
 
     Trust: input from a client: names become paths of this machine.
-    Raises ``RefusedError``: the text says which rule.
+    Raises ``RefusedError``: the text names the broken rule.
     """
     if not 1 <= len(files) <= quotas.upload_files:
         raise RefusedError(
@@ -304,7 +305,7 @@ def _listed(file: object) -> ListedFile:
 
 
 def wrong_with_path(path: str) -> str:
-    """Why a relative path is refused; empty if it is not."""
+    """Returns why a relative path is refused; empty if it is allowed."""
     steps = path.split("/")
     if path.startswith("/"):
         return "has an absolute name"
