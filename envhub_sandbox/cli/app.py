@@ -68,14 +68,14 @@ _COMMANDS: dict[str, tuple[str, str | Where]] = {
 }
 
 _FIRST = {"--n-envs", "--network", "--sandbox", "--task"}
-"""Of the options of ``make_env`` those that a help has; ``--help-all`` has them all."""
+"""The options of ``make_env`` that ``--help`` shows; ``--help-all`` shows all."""
 _REPLACED = {
     "push": "envhub check . && hf upload OWNER/NAME .",
     "verify": "envhub lock --check FILE",
     "prefetch": "envhub inspect --download REF",
     "--server-key": "tcp://HOST:PORT KEY",
 }
-"""What to use instead of commands and options that there were."""
+"""The replacements of former commands and options."""
 
 
 class Program(TyperGroup):

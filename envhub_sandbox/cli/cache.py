@@ -170,7 +170,7 @@ def _told(snapshots: list[StoredSnapshot], environments: list[Any], built: list[
 
 
 def _documents(entries: Sequence[Stored], **named: str) -> list[dict[str, Any]]:
-    """What is stored as data: by name, which attribute; and what all have."""
+    """The entries as data; ``named``: the attribute of each further field."""
     return [
         {
             **{name: getattr(entry, attribute) for name, attribute in named.items()},

@@ -216,7 +216,7 @@ class SandboxVecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """What each sub-environment renders, if its render mode is ``rgb_array``."""
+        """The frames of the sub-environments, if the render mode is ``rgb_array``."""
         if self.render_mode == "rgb_array":
             return self.vector.render() or [None] * self.num_envs
         warnings.warn(

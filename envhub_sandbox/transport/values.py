@@ -1,11 +1,11 @@
-"""What crosses the wire and is not plain: spaces, specs, generators and tensors that a worker
-describes, made here of plain values; and the caller's own values, pickled on their way in.
+"""Values that are not plain data: makes spaces, specs, generators and tensors from a worker's
+descriptions, and pickles the caller's own values for the jail.
 
-Trust: every description is input from the worker. Nothing of the worker's is executed or unpickled:
-what comes is fields of a fixed form, each held against what such a thing can have. numpy checks
-next to nothing of a generator's state: an index behind a key makes the next draw a crash, one
-before a buffer makes the process's own memory the numbers, and a generator that stands still makes
-``integers`` loop for ever. So every field is held against what that generator can hold.
+Trust: every description is input from the worker. The client executes and unpickles nothing of it:
+a description has the fields of a fixed form, and each value is checked. numpy checks almost nothing
+of a generator's state: an index beyond the key makes the next draw crash, an index before the
+buffer returns the process's own memory as numbers, and a generator whose state never changes makes
+``integers`` loop for ever. So every field is compared with the values that the generator can have.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from envhub_worker.protocol.spaces.reader import (
 )
 
 _Form = Mapping[str, Union[range, tuple[Any, int], "_Form"]]
-"""The fields of a state: integers of a range, arrays of a dtype and a length, further fields."""
+"""The form of a state: for each field a range of integers, a dtype and length, or a form."""
 
 
 def generator(state: object) -> np.random.Generator:
-    """A generator in a given state. Trust: the state is input from the worker.
-    Raises ``RemoteProtocolError``: it is no state that a generator can have.
+    """Make a generator in a given state. Trust: the state is input from the worker.
+    Raises ``RemoteProtocolError``: no generator can have this state.
     """
     name = state.get("bit_generator") if type(state) is dict else None
     form = _FORMS.get(name) if type(name) is str else None
@@ -61,8 +61,8 @@ def generator(state: object) -> np.random.Generator:
 
 
 def seeds(value: object) -> Any:
-    """A seed, or one each. Trust: input from the worker.
-    Raises ``RemoteProtocolError``: it is neither a number nor None.
+    """Check a seed, or a tuple of seeds, and return it. Trust: input from the worker.
+    Raises ``RemoteProtocolError``: a seed is neither a number nor None.
     """
     for seed in value if type(value) is tuple else (value,):
         if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer))):
@@ -71,7 +71,7 @@ def seeds(value: object) -> Any:
 
 
 def _misfit(form: _Form, value: Any, path: str) -> str | None:
-    """Which field has no such value; fields are exactly those of the form."""
+    """Describe the first field that does not fit the form; None if all fields fit."""
     if type(value) is not dict or value.keys() != form.keys():
         return f"{path} has the fields {', '.join(form)}"
     for name, wanted in form.items():
@@ -119,7 +119,7 @@ def installed_torch() -> Any:
         return None
     try:
         import torch
-    except Exception as error:  # not the worker's fault, whose tensor it was to be
+    except Exception as error:  # not the worker's fault
         raise DependencyError(
             f"torch is installed here, and cannot be imported: {error}"
         ) from error
@@ -144,14 +144,14 @@ _SHOWN = 200
 
 
 class DescriptionReader:
-    """Makes what one message describes, within one budget for all of it: the message's bytes."""
+    """Makes the objects that one message describes, within a budget from the message's bytes."""
 
     def __init__(self, limits: WireLimits) -> None:
         self._reader = SpaceReader(limits.message_bytes // ELEMENT_BYTES, generator=generator)
 
     def __call__(self, code: int, value: object) -> object:
-        """Make what is described. Trust: input from the worker.
-        Raises ``RemoteProtocolError``: it is impossible, or costs too much.
+        """Make the described object. Trust: input from the worker.
+        Raises ``RemoteProtocolError``: the description is malformed, or exceeds the budget.
         """
         if code == SPACE:
             return self._reader.space(value)
@@ -165,11 +165,11 @@ class DescriptionReader:
 
 
 unpacked = partial(m.unpack, tensors=to_tensor, things=DescriptionReader)
-"""A runner's message, with what it describes; as ``m.unpack``. Trust: input from the worker."""
+"""``m.unpack`` for a runner's message, which may describe objects. Trust: worker's input."""
 
 
 def _spec(value: object) -> Any:
-    """A spec; a description of one whose id this Gymnasium cannot read."""
+    """Make a spec; if this Gymnasium cannot read its id, an object that shows its facts."""
     facts = read_spec_facts(value)
     spec = spec_of(facts)
     return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if spec is None else spec
@@ -178,7 +178,7 @@ def _spec(value: object) -> Any:
 def spec_of(description: dict[str, Any] | None) -> EnvSpec | None:
     """A spec with facts that ``read_spec`` has checked; None if this Gymnasium takes no such id.
 
-    Its entry points are texts, so that it can be written as JSON, and name what refuses.
+    Its entry points are texts, so that it can be written as JSON; they name ``not_here``.
     """
     # gym.make imports what stands before a colon
     if not description or description.get("id") is None or ":" in description["id"]:
@@ -200,7 +200,7 @@ def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
 
 
 def pickled(value: object, *, lasting: bool = False) -> bytes:
-    """Pickle a value of the caller's for the jail, with classes of ``__main__``.
+    """Pickle a value of the caller for the jail, including classes of ``__main__``.
     ``lasting``: whether the bytes must say everything, without names of the caller's own code.
     Raises ``TypeError``: a ``lasting`` value has such code, which may differ the next time.
     """
@@ -212,7 +212,7 @@ def pickled(value: object, *, lasting: bool = False) -> bytes:
 
 
 def framed(value: object) -> bytes | memoryview:
-    """The same, in a frame of its own where that is worth it."""
+    """Pickle a value of the caller; a large pickle becomes a frame of its own."""
     data = pickled(value)
     return data if len(data) <= INLINE_BYTES else memoryview(data)
 

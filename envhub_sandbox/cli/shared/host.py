@@ -70,7 +70,7 @@ def _groups(process: Path) -> Iterator[Path]:
     for kind, root, top in _mounts(process / "mountinfo"):
         group = PurePosixPath(own.get(kind, "/"))
         below = group.relative_to(root) if group.is_relative_to(root) else PurePosixPath("..")
-        # of a container it may be out of sight; both paths begin with .. where it was moved
+        # our group may be outside of a container's mount; the paths of a moved group begin with ..
         folder = top / ("" if ".." in below.parts else below)
         yield from (group for group in (folder, *folder.parents) if group.is_relative_to(top))
 

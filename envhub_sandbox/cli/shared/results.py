@@ -125,7 +125,7 @@ def _mean(stats: dict[str, float] | None, *, spread: bool = False) -> str:
 
 
 def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:
-    """Where the code came from, what ran it, and what confined it."""
+    """Print the repository, the interpreter and packages, and the confinement of a run."""
     show("repository", _repository(provenance))
     for asset in provenance.get("assets") or ():
         show("could read", str(asset))
@@ -158,7 +158,7 @@ def _interpreter(interpreter: dict[str, str], packages: dict[str, str], names: s
 
 
 def _confinement(provenance: dict[str, Any], in_process: bool) -> list[tuple[str, str]]:
-    """What ``envhub check`` says of it; ``--json`` has the layers by name."""
+    """The rows about confinement, as ``envhub check`` prints them."""
     if in_process:
         return [("confined by", "nothing: the code ran in this process")]
     if not provenance.get("layers"):

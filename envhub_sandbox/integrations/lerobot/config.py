@@ -181,7 +181,7 @@ class SandboxedEnvConfig(EnvConfig):
         return self.repo
 
     def get_env_processors(self) -> tuple[Any, Any]:
-        """What LeRobot's own suites of the same form have, or what the repository declares."""
+        """The processors that the repository declares, or LeRobot's own for this form."""
         return processors(self._steps), processors([])
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> EnvSuites:
