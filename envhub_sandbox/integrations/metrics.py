@@ -95,5 +95,5 @@ def _latency(rows: list[Row]) -> Metric:
 
 
 def _values(row: Row) -> list[str]:
-    """The labels' values. Trust: suite and task are the worker's words."""
+    """The values of the labels. Trust: the worker chose suite and task."""
     return [printable(value, _LABEL_CHARS) for value in row.labels]

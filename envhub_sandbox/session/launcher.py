@@ -381,6 +381,9 @@ class Launcher:
         """
         if loaded.closed or loaded.closing:  # closed by a signal handler or a thread
             return
+        # interruption.md, rule 7: ``ended`` is set after the end was requested, then the use is
+        # released, then ``closed`` is set. After an interrupt the next call continues there. After
+        # any other error the use is released at once.
         try:
             loaded.closing = True
             if not loaded.ended:

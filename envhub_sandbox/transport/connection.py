@@ -179,6 +179,7 @@ class WorkerConnection:
     def _send(self, request_id: int, frames: list[Buffer]) -> None:
         travelling = frames
         if self._link is not None:
+            # noted before it is sent, so that ``receive`` can send it again over a new connection
             with self._link.lock:
                 self._sent[request_id] = self._link.next_number(), frames
             if self._compression:

@@ -230,7 +230,7 @@ def expects_json(arguments: Sequence[str]) -> Iterator[None]:
 
 
 def print_json_error(kind: str, message: str, code: int) -> None:
-    """Print an error as the document that was asked for, if no other has been printed."""
+    """Print an error as a JSON document, if the user wants one and none was printed yet."""
     if _json_left.get():
         print_json({"error": {"type": kind, "message": message, "exit_code": code}})
 

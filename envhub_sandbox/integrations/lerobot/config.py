@@ -46,11 +46,11 @@ _OPTIONS = {
 
 
 class SpareSuites:
-    """Environments that have answered for their spaces, kept for the request that follows.
+    """Keeps environments that were opened to read their spaces, for the request that follows.
 
-    LeRobot wants the features of an environment before it makes any. The jail that answered is used
-    then, so that a simulator is loaded once. Where no request follows within ``seconds``, as before
-    a training whose first evaluation is an hour away, it is closed. One is kept for each key.
+    LeRobot reads the features of an environment before it makes any. The same jail is used for
+    both, so that a simulator is loaded once. If no request follows within ``seconds``, as before a
+    training whose first evaluation is an hour away, it is closed. One is kept for each key.
     """
 
     def __init__(self, seconds: float = 60.0) -> None:

@@ -67,7 +67,7 @@ def steps_for(
     observations: Space[Any], metadata: Mapping[str, Any], keys: Mapping[str, str | None]
 ) -> list[Step]:
     """The steps that the repository names, else LeRobot's own for observations of this form.
-    ``metadata``: the environment's. Trust: the worker's words.
+    ``metadata``: the environment's metadata. Trust: input from the worker.
     ``keys``: the caller's ``state_keys`` and ``camera_keys``, as IsaaclabArenaEnv takes them.
     Raises ``ValueError``: the repository names a step that it may not name, or that is not so
     configured.
