@@ -1,1 +1,1 @@
-"""Features that the core finds by name and does without, a folder for each."""
+"""Optional features, a folder each, which the core finds by name and works without."""

@@ -32,7 +32,7 @@ _LIMITS = {
 
 def confine_to_bytecode_folder(folder: str) -> None:
     """Bind this single-threaded process to a folder, for good.
-    Raises ``LayerUnavailableError``: a layer cannot be had.
+    Raises ``LayerUnavailableError``: the host lacks a layer.
     """
     process.apply_limits({limit: (value, value) for limit, value in _LIMITS.items()})
     library = os.path.realpath(os.path.dirname(os.__file__))

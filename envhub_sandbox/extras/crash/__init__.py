@@ -1,1 +1,1 @@
-"""Crash bundles: what was asked is noted, written after a death, read and replayed."""
+"""Crash bundles: records requests, writes them after a death, reads and replays them."""

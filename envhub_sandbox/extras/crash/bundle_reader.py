@@ -1,8 +1,8 @@
-"""Reads crash bundles. Trust: a bundle is a stranger's input, who would like us to run something.
+"""Reads crash bundles. Trust: a bundle may come from a stranger who wants us to run his code.
 
-Only regular files of bounded size are read, nothing is unpickled, and every value is checked for
-its type before it is used. ``wishes`` says what a replay uses of this machine; the user grants it,
-but for bundles that this program has written where it writes them.
+This module reads only regular files of bounded size, unpickles nothing, and checks the type of
+every value before use. ``wishes`` names the parts of this machine that a replay would use. The user
+must grant these, except for the user's own bundles in this program's folder.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class Bundle:
 
     Attributes:
         label: Repository, commit and entry file.
-        reference: The same, pinned, as ``make_env`` takes it.
-        is_ours: It lies where this program writes the caller's bundles.
+        reference: The pinned reference for ``make_env``.
+        is_ours: Whether it lies in the folder where this program writes the caller's bundles.
         files: Digest by path.
         death: ``reason``, ``exit_code``, ``signal``, ``request``, ``message``.
         load: The arguments of the repository's ``make_env``.
@@ -72,15 +72,15 @@ class Bundle:
     steps: int
 
     def requests(self) -> Iterator[m.Message]:
-        """What was asked, in order; the last one was never answered.
+        """Yields the requests in order; the last one was never answered.
 
-        Decoded one at a time: all at once may take seventy times their bytes in memory.
+        Decodes one at a time: all at once may take seventy times their bytes in memory.
         """
         return _messages(self.packets)
 
 
 def load_bundle(folder: Path) -> Bundle:
-    """The bundle in a folder. Raises ``BundleError``: there is none, or it breaks a rule."""
+    """Loads the bundle in a folder. Raises ``BundleError``: there is none, or it breaks a rule."""
     try:
         document = json.loads(_read(folder, "bundle.json", MAX_DOCUMENT_BYTES))
         if type(document) is not dict or document.get("format") != FORMAT:
@@ -183,8 +183,8 @@ def _member(mapping: dict[str, Any], name: str, kind: type[T]) -> T:
 
 
 def wishes(bundle: Bundle) -> str:
-    """What a replay of a stranger's bundle would use of this machine, in a line for the user.
-    Raises ``BundleError``: it is too long to be shown whole.
+    """Returns a line for the user: the parts of this machine that a stranger's replay would use.
+    Raises ``BundleError``: the line is too long to be shown whole.
     """
     policy = _chosen(bundle.arguments.get("policy"), _OF_POLICY)
     needed = {"repository": bundle.reference, **policy, **_chosen(bundle.arguments, _OF_MAKE_ENV)}
@@ -200,7 +200,7 @@ def _chosen(mapping: Any, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def replayed_arguments(bundle: Bundle) -> dict[str, Any]:
-    """The arguments of ``make_env`` that make it again."""
+    """Returns the arguments of ``make_env`` that rebuild the bundle's environment."""
     policy = _chosen(bundle.arguments.get("policy"), _OF_POLICY) | {"crash_history": 0}
     arguments = {
         **_chosen(bundle.arguments, _OF_MAKE_ENV),

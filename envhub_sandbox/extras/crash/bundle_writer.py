@@ -1,4 +1,4 @@
-"""Crash bundles: what led to the death of a jail, written down so that it can be done again.
+"""Writes crash bundles: the requests that led to the death of a jail, for a replay.
 
 ::
 
@@ -8,8 +8,8 @@
         arguments.bin         make_env's own arguments: one packet of the wire
         requests.bin          what was asked: a packet for each request
 
-Nothing in it is pickled. It is built under another name and renamed into place; only its owner
-may read it; the oldest give way to the newest. ``bundle_reader`` reads it.
+A bundle contains no pickles. It is built under another name and renamed into place; only its owner
+may read it. New bundles replace the oldest ones. ``bundle_reader`` reads them.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _document(crash: Crash) -> dict[str, Any]:
 
 
 def _concealed(value: Any, crash: Crash) -> Any:
-    """A text without the values of variables that the jail was granted and may have printed."""
+    """Removes the values of granted variables, which the jail may have printed, from a text."""
     if isinstance(value, str):
         for secret, name in _secrets(crash.options.get("policy")):
             value = value.replace(secret, f"<the value of {name}>")
@@ -129,12 +129,12 @@ def _text(frames: list[bytes]) -> str:
 
 
 def packet(frames: Sequence[Buffer]) -> bytes:
-    """A message as a bundle keeps it."""
+    """Returns a message in the form of a bundle's file."""
     return b"".join(map(bytes, pack_packet(1, frames)))
 
 
 def death_of(error: WorkerDiedError | WorkerTimeoutError) -> dict[str, Any]:
-    """How it ended, as data."""
+    """Returns a jail's death as plain data."""
     if isinstance(error, WorkerTimeoutError):
         detail = f"{error.timeout_s} s" if error.timeout_s else ""
         how = {"reason": "timeout", "exit_code": None, "signal": None, "detail": detail}

@@ -1,4 +1,4 @@
-"""``envhub replay``: repeat what a crash bundle holds, and say whether the jail dies again."""
+"""``envhub replay``: repeats a crash bundle's requests and reports whether the jail dies again."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _made(
     stack: contextlib.ExitStack,
     changed: list[str],
 ) -> Any:
-    """The environment that the bundle is about; None if it is about ``make_env`` alone."""
+    """Makes the bundle's environment; None if the jail died in ``make_env``."""
     from envhub_sandbox.extras.crash.replay import changed_files
     from envhub_sandbox.factory.make_env import make_env
     from envhub_sandbox.session.repository import Recipe
@@ -152,7 +152,7 @@ _CONCLUSIONS = {
 
 
 def _row(requests: int, steps: int, death: dict[str, Any] | None) -> str:
-    """An ending in few words. Trust: from the bundle, or from the worker."""
+    """Describes an ending in few words. Trust: text from the bundle or the worker."""
     words = "nothing died" if death is None else safe_line(death["reason"], 100)
     if death is not None and death["signal"]:
         words += f" ({safe_line(death['signal'], 100)})"

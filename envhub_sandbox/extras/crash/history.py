@@ -1,8 +1,8 @@
-"""What was asked of an environment since it was last seeded: enough to ask it again.
+"""Records an environment's requests since its last seed: enough to repeat them.
 
-Kept in memory, bounded by count and by bytes, and read only when the environment's jail has died.
-A step costs a copy of its actions. Of other requests the frames that were sent are copied: the
-caller may change what they were made of afterwards.
+The record is in memory, bounded by count and by bytes, and read only if the environment's jail
+dies. A step costs a copy of its actions. For other requests the sent frames are copied, since the
+caller may change the arguments afterwards.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _SLICED: dict[type[m.Message], tuple[str, ...]] = {
 
 
 class RecordedRequest(NamedTuple):
-    """A request as it is kept: frames without anything pickled; ``lasts``: beyond a reset."""
+    """A recorded request: frames without pickles; ``lasts``: whether a reset keeps it."""
 
     frames: list[bytes]
     lasts: bool = False
@@ -53,13 +53,13 @@ class History(Recorder):
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
-        # Of a step a copy of its actions, which is packed only after a death: that takes longer
-        # than many a step.
+        # A step is kept as a copy of its actions. Only a death packs it: packing takes longer than
+        # many steps.
         self._log: deque[Any] = deque()
         self.started()
 
     def started(self) -> None:
-        """See ``Recorder``: requests to the former jail are forgotten."""
+        """Forget the requests to the previous jail: see ``Recorder``."""
         self._begin(())
 
     def _begin(self, entries: Sequence[RecordedRequest]) -> None:
@@ -97,7 +97,7 @@ class History(Recorder):
             self._room += _size(self._log.popleft())
 
     def recording(self) -> list[list[bytes]]:
-        """The frames of what is kept, in order."""
+        """Returns the frames of the recorded requests, in order."""
         return [
             entry.frames if isinstance(entry, RecordedRequest) else encoded(m.Step(0, entry))
             for entry in self._log
@@ -117,7 +117,7 @@ class History(Recorder):
 
 
 def encoded(message: m.Message) -> list[bytes]:
-    """A message as it can be kept, with descriptions in place of what only pickle could carry."""
+    """Encodes a message, with descriptions in place of values that would need pickle."""
     try:
         return [*map(bytes, m.pack(message))]
     except EnvHubError:

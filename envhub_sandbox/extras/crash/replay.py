@@ -1,4 +1,4 @@
-"""Asks an environment again what was asked of one that died, and says whether this one does too."""
+"""Repeats the requests of an environment that died, and tells whether it dies again."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _UNFIT = (ActionError, TypeError, ValueError)
 
 
 class Verdict(str, Enum):
-    """How a replay ended."""
+    """The ways in which a replay can end."""
 
     SAME = "same"
     DIFFERENT = "different"
@@ -27,13 +27,13 @@ class Verdict(str, Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayResult:
-    """What a replay did.
+    """The result of a replay.
 
     Attributes:
-        requests: Requests of the bundle that were asked, the last one included.
-        steps: Steps among them.
-        death: What ended it: ``reason``, ``exit_code``, ``signal``, ``message``; None if nothing.
-        note: What else there is to say, or "".
+        requests: Number of repeated requests, the last one included.
+        steps: Number of steps among them.
+        death: ``reason``, ``exit_code``, ``signal`` and ``message``; None if no jail died.
+        note: A further remark, or "".
     """
 
     verdict: Verdict
@@ -44,7 +44,7 @@ class ReplayResult:
 
 
 def replay(make: Callable[[], Any], bundle: Bundle) -> ReplayResult:
-    """Make the environment, which may raise as ``make_env``, and repeat a bundle's requests."""
+    """Makes the environment (raises like ``make_env``) and repeats a bundle's requests."""
     try:
         env = make()
     except (WorkerDiedError, WorkerTimeoutError) as error:
@@ -132,5 +132,5 @@ def _ask_one(env: Any, message: m.GetOne | m.CallOne) -> None:
 
 
 def changed_files(recorded: dict[str, str], found: dict[str, str]) -> Sequence[str]:
-    """The paths of files that were changed, added or removed since."""
+    """Returns the paths of files that were changed, added or removed since the death."""
     return sorted(path for path in {*recorded, *found} if recorded.get(path) != found.get(path))

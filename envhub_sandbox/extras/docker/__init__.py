@@ -1,1 +1,1 @@
-"""The worker in a container: its command line, its proof, its monitor and its remains."""
+"""The worker in a container: command line, attestation, monitor, and removal of leftovers."""

@@ -1,7 +1,7 @@
-"""What a container's server says of its surroundings, against what was asked for. Pure.
+"""Compares the confinement that a container's server reports with the requested one. Pure.
 
-Trust: the server is our code, in an image that the caller chose. What it says is bounded and
-typed here all the same, and whatever does not hold ends the matter.
+Trust: the server is our code, but in an image that the caller chose. This module checks bounds and
+types of the report, and any mismatch is an error.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _NATIVE_RUNTIMES = (None, "runc", "crun", "io.containerd.runc.v2")
 
 
 def parse(line: bytes) -> Surroundings:
-    """The server's announcement. Raises ``WorkerStartupError``: it is something else."""
+    """Parses a server's announcement. Raises ``WorkerStartupError``: the text is none."""
     try:
         with UNTRUSTED:
             return Surroundings.read(json.loads(line))
@@ -32,12 +32,12 @@ def parse(line: bytes) -> Surroundings:
 
 
 def profile_for(wanted: str, surroundings: Surroundings) -> str:
-    """The profile of jails in a container where the policy names ``wanted``.
+    """Returns the profile of jails in a container if the policy names ``wanted``.
 
-    The container's own walls stand around every jail. So ``"strict"`` takes the strongest that can
-    be had in there, as long as something keeps a jail from the server next to it: namespaces, or
-    Landlock. The weaker profiles are taken at their word.
-    Raises ``SandboxUnavailableError``: it cannot be had.
+    The container itself confines every jail. So ``"strict"`` means the strongest profile that works
+    in the container, if that separates a jail from the server beside it, by namespaces or Landlock.
+    A weaker profile is used as named.
+    Raises ``SandboxUnavailableError``: the container cannot enforce the profile.
     """
     if wanted != "strict":
         if wanted in surroundings.profiles:
@@ -82,7 +82,7 @@ def layers(wanted: Container, surroundings: Surroundings, title: str) -> list[di
 
 
 def _chosen(wanted: Container, surroundings: Surroundings) -> Iterator[tuple[str, bool, str]]:
-    """What is asked for by some containers only."""
+    """Yields the layers that only some containers request."""
     if wanted.network == "none" and not wanted.only_client:
         own = set(surroundings.devices) <= {"lo"}
         yield "container-network", own, "no device but its own loopback"
@@ -108,7 +108,7 @@ def _amount(name: str, most: float) -> str:
 
 
 def _absent(wanted: Container) -> list[dict[str, Any]]:
-    """What the caller has gone without."""
+    """Returns the layers that the caller has given up."""
     missing = []
     if wanted.only_client:
         who = "jails have none of it" if wanted.network == "none" else "and jails, by choice"

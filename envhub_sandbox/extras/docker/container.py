@@ -39,7 +39,7 @@ _UNUSED_USERS = range(0x6E000000, 0x6EFFFFFF)
 
 @dataclass(kw_only=True)
 class ContainerOptions:
-    """What a caller says of containers: see ``DockerSandbox``."""
+    """A caller's options for containers: see ``DockerSandbox``."""
 
     image: str = "envhub-worker"
     engine: str | None = None
@@ -55,8 +55,8 @@ class ContainerServer(LocalServer):
     """A worker server in a container that we started.
 
     Attributes:
-        profile: The profile of its jails, chosen among what can be had in there.
-        python: Their interpreter; empty for the server's own.
+        profile: The profile of its jails.
+        python: The jails' interpreter; empty for the server's own.
     """
 
     wanted: Container
@@ -83,14 +83,14 @@ class RepositoryContainer(Sandbox):
     assets: tuple[Path, ...] = ()
 
     def runs_on(self, runtime: Runtime) -> Runtime:
-        """The image, by its id."""
+        """The id of the image."""
         packages = f" with {self.packages}" if self.packages else ""
         return Runtime(f"{self.image} in {self.engine.kind}{packages}")
 
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
     ) -> ServerUse[WorkerServer]:
-        """The repository's container, started if there is none.
+        """Returns the repository's container; starts one if there is none.
 
         Its limits are for one ``make_env`` alone, so only an unused one changes hands.
         """
@@ -130,7 +130,7 @@ class RepositoryContainer(Sandbox):
         return server
 
     def title(self, wanted: Container) -> str:
-        """What it is, for the report."""
+        """Describes the container, for the report."""
         engine, options = self.engine, self.options
         return (
             f"{engine.kind} {engine.version}, image {options.image} ({self.image[:19]}), "
@@ -207,8 +207,8 @@ class RepositoryContainer(Sandbox):
 
 
 def _user(sockets: Path) -> tuple[int, int]:
-    """Who the container's processes are, and own the sockets' folder: the caller; for root somebody
-    who owns nothing else.
+    """Returns the user of the container's processes and of the sockets' folder: the caller; for
+    root a user that owns nothing else.
     """
     owner = (-1, -1)
     if sys.platform != "win32":
@@ -221,7 +221,7 @@ def _user(sockets: Path) -> tuple[int, int]:
 
 
 def _answer(ready: int) -> bytes:
-    """The monitor's one line."""
+    """Reads the monitor's only line."""
     readable = readable_within(ready, STARTUP_S)
     answer = os.read(ready, _ANNOUNCEMENT_BYTES + 1) if readable else b""
     if not answer:
@@ -231,7 +231,7 @@ def _answer(ready: int) -> bytes:
 
 
 def check_started(engine: Engine, wanted: Container, answer: bytes) -> None:
-    """Say why there is no container, if there is none.
+    """Raises an error that says why the container did not start, if it did not.
     Raises ``SandboxUnavailableError``: the engine would not start it; ``WorkerStartupError``: the
     program in it ended.
     """

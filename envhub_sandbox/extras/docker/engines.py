@@ -38,9 +38,9 @@ class Engine:
         kind: ``"docker"`` or ``"podman"``: whose options it takes.
         rootless: Whether it runs as a plain user.
         remapped: Whether it maps the users of containers to others (``userns-remap``).
-        passed_over: Why it is this one, where another one would come first.
-        machine: Its architecture, which on macOS and Windows is that of a virtual machine.
-        cpus: Likewise the number of its processors; 0 for unknown.
+        passed_over: Why a preferred engine was not chosen.
+        machine: Its architecture; on macOS and Windows that of a virtual machine.
+        cpus: The number of that machine's processors; 0 for unknown.
     """
 
     kind: str
@@ -53,12 +53,12 @@ class Engine:
     cpus: int = 0
 
     def run(self, *arguments: str) -> str:
-        """What a command prints. Raises ``EngineError``: it failed, or did not answer."""
+        """Runs a command; returns its output. Raises ``EngineError``: it failed or hung."""
         return _run(self.command, *arguments)
 
 
 def environment() -> dict[str, str]:
-    """What the engine's program needs of ours; a token of the Hub is not among it."""
+    """Returns our environment variables that the engine needs, without a token of the Hub."""
     return own_variables() | {
         name: value
         for name, value in os.environ.items()
@@ -83,7 +83,7 @@ def _run(command: str, *arguments: str) -> str:
 
 
 def find_engine(name: str | None) -> Engine:
-    """The engine of that name; with None, docker if it answers, else podman.
+    """Returns the engine of a name; for None docker if it answers, else podman.
     Raises ``PolicyError``: there is no engine of that name; ``SandboxUnavailableError``: it is not
     installed, does not run, or may not be used.
     """
@@ -101,7 +101,7 @@ def find_engine(name: str | None) -> Engine:
 
 
 def is_elsewhere(name: str) -> bool:
-    """Whether an engine is set to work on another machine: nothing of ours can be there."""
+    """Whether an engine works on another machine, which lacks our files."""
     host = os.environ.get("DOCKER_HOST")
     return name == "docker" and bool(host) and not str(host).startswith(("unix:", "npipe:"))
 
@@ -250,7 +250,7 @@ def own_limits(engine: Engine) -> tuple[str, ...]:
 
 
 def find_image(engine: Engine, image: str) -> str:
-    """The id of an image, so that what was looked at is what runs.
+    """Returns the id of an image, so that the inspected image is the one that runs.
     Raises ``PolicyError``: that is no name of an image: the engine would read it as something else;
     ``SandboxUnavailableError``: the engine does not have it.
     """

@@ -1,9 +1,9 @@
-"""What clients that were killed left behind: containers, folders, control groups.
+"""Finds leftovers of killed clients: containers, folders, control groups.
 
-Only what is certainly ours and not in use any more. A process that lives holds a lock: a client
-that of its folder, which its container names in a label, and a server those of its folders and
-control groups. What has no such lock is left alone. So is what belongs to another user, whose files
-we may not even see; root sees all, and removes every user's containers and control groups.
+It finds only objects that are certainly ours and no longer in use. A live process holds a lock: a
+client that of its folder, which a label of its container names, and a server those of its folders
+and control groups. Objects without such a lock are left alone, and so are another user's, whose
+files we may not even see; root sees all, and removes every user's containers and control groups.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Leftover:
     engine: Engine | None = None
 
     def remove(self) -> bool:
-        """Remove it; whether it is gone."""
+        """Remove the leftover; returns whether it is gone."""
         if self.engine is not None:
             with contextlib.suppress(EngineError):
                 self.engine.run("rm", "--force", "--volumes", self.name)
@@ -63,11 +63,11 @@ class Leftover:
 
 
 class Found(NamedTuple):
-    """What a search found.
+    """The result of a search.
 
     Attributes:
-        leftovers: Everything that can be removed.
-        unasked: The engines that are installed and could not be asked, with the reason.
+        leftovers: The objects that can be removed.
+        unasked: The installed engines that did not answer, with the reason.
     """
 
     leftovers: list[Leftover]
@@ -75,7 +75,7 @@ class Found(NamedTuple):
 
 
 def find() -> Found:
-    """Look everywhere. Removes nothing."""
+    """Searches for all kinds of leftovers. Removes nothing."""
     containers, unasked = _containers()
     folders = [
         Leftover("folder", str(path))

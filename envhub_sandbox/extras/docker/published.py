@@ -1,9 +1,9 @@
-"""A container that is reached by a port on loopback: its engine runs in a virtual machine.
+"""A container behind a port on loopback, for engines that run in a virtual machine.
 
-So it is on macOS and Windows. Such a container shares no memory, no sockets and no files with this
-process: the server in it is one for clients on other hosts, and is sent the repository's files. It
-lets one client in, by a key that was made for it. It ends with its stdin, of which this process
-alone has the other end.
+Engines on macOS and Windows do. Such a container shares no memory, sockets or files with this
+process: its server is one for clients on other hosts, and the client uploads the repository's
+files. It admits one client, by a key made for it. It ends with its stdin, whose other end only this
+process holds.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _LINE_BYTES = 65536
 
 @dataclass(eq=False)
 class PublishedContainer(RepositoryContainer):
-    """The sandbox of one repository: one such container, which its environments share."""
+    """The sandbox of one repository: a published container, which its environments share."""
 
     _files: UploadedRepository = field(init=False, repr=False)
 
@@ -97,8 +97,8 @@ def _server_key(answer: bytes) -> bytes:
 
 
 class PublishedServer(RemoteServer):
-    """A worker server in such a container.
-    ``profile``: that of its jails, chosen among what can be had in there.
+    """A worker server in a published container.
+    ``profile``: the profile of its jails.
     """
 
     is_ours = True
@@ -112,7 +112,7 @@ class PublishedServer(RemoteServer):
 
     @property
     def runs(self) -> bool:
-        """Whether its container has not ended."""
+        """Whether the container still runs."""
         return self._container.runs
 
     def stop(self) -> None:
@@ -193,7 +193,7 @@ class EngineRun:
 
     @property
     def runs(self) -> bool:
-        """Whether the container has not ended."""
+        """Whether the container still runs."""
         return self._process is not None and self._process.poll() is None
 
     def stop(self) -> None:

@@ -69,7 +69,7 @@ def enter(
     jail: JailContext, descriptors: Iterable[int], give_to_init: Callable[[int], None]
 ) -> None:
     """Confine this single-threaded process for good, and test that it holds.
-    Raises ``LayerUnavailableError``: a layer cannot be had, or a denial does not hold.
+    Raises ``LayerUnavailableError``: the host lacks a layer, or a denial does not hold.
 
     Args:
         descriptors: Every descriptor that may be open.

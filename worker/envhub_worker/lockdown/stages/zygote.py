@@ -49,7 +49,7 @@ def enter(config: ZygoteConfig) -> Common:
         covered = mounts.proc_to_cover()
     else:
         if config.user is not None:
-            # no pid namespace ends its jails with it: it must live long enough to do that
+            # SIGTERM, not SIGKILL: without a pid namespace the zygote must end its jails itself.
             _become(config, signal.SIGTERM)
             _check_interpreter()
         covered = ([], [])

@@ -25,16 +25,18 @@ SERVED_PRIVATE = frozenset({"_ensure", "_max_episode_steps"})
 
 PROBED = frozenset(
     {
-        # of files, mappings, classes, numbers and dates; by the standard library, pandas, tabulate
+        # The standard library, pandas and tabulate look for attributes of files, mappings, classes,
+        # numbers and dates.
         *("fileno", "read", "write", "getvalue", "keys", "items", "mro"),
         *("as_integer_ratio", "is_integer", "conjugate", "real", "imag", "isoformat"),
-        # of arrays, tensors and tables; by numpy, pandas, matplotlib, torch, jax, tqdm, wandb
+        # numpy, pandas, matplotlib, torch, jax, tqdm and wandb look for those of arrays, tensors
+        # and tables.
         *("dtype", "shape", "ndim", "size", "flat", "item", "tolist", "toarray", "tocoo"),
         *("to", "cpu", "detach", "numpy", "pin_memory", "block_until_ready", "is_tensor_like"),
         *("to_numpy", "values", "index", "input_objs", "aval", "weak_type"),
-        # by encoders to JSON, which call them: pandas, simplejson, wandb
+        # JSON encoders (pandas, simplejson, wandb) look for methods and call them.
         *("toDict", "for_json", "json_encode"),
-        # by notebooks: IPython's help and completion; by rich, which probes for attributes
+        # Notebooks look for those of IPython's help and completion; rich probes for others.
         *("getdoc", "trait_names", "awehoi234_wdfjwljet234_234wdfoijsdfmmnxpi492"),
     }
 )
