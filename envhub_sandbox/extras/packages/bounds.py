@@ -1,8 +1,8 @@
-"""How large an environment may become, and how much of the disk it has to leave free.
+"""Bounds the size of an environment and the free space that it must leave on the disk.
 
-A small file on an index can be unpacked to a disk's worth. So uv is watched: by what it says that
-it downloads, by what lies in the folder, and by what is left of the disks that it writes to; and
-the kernel ends it at a single file over the bound.
+A small file on an index may unpack to fill a disk. So this module watches uv: the downloads that it
+announces, the size of the folder, and the free space of the disks that it writes to. The kernel
+ends uv if a single file exceeds the bound.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ FILES_VARIABLE = "ENVHUB_ENVIRONMENT_FILES"
 MAX_BYTES = 16 * 2**30
 MAX_FILES = 400_000
 LEFT_FREE = 64 * 2**20
-"""Bytes of a disk that are left to everybody else."""
+"""Bytes of a disk that an installation leaves to other programs."""
 _ANNOUNCED = re.compile(r"Downloading (\S{1,200}) \((\d{1,9}(?:\.\d{1,9})?)([KMGT]iB)\)")
 _UNITS = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What one environment may have: bytes (before bytecode is made), and files with folders."""
+    """Limits of one environment: bytes (before bytecode is made), and files including folders."""
 
     bytes: int
     files: int
 
     @classmethod
     def set(cls) -> Bounds:
-        """Those of this machine's user; ``DependencyError`` if a variable holds no number."""
+        """Reads the user's limits; ``DependencyError`` if a variable holds no number."""
         return cls(_number(BYTES_VARIABLE, MAX_BYTES), _number(FILES_VARIABLE, MAX_FILES))
 
     def check(self, size: int, files: int, subject: str) -> None:
-        """Refuse more with ``DependencyError``."""
+        """Raise ``DependencyError`` if the size or the number of files exceeds its limit."""
         if size > self.bytes:
             raise DependencyError(
                 f"{subject} {size_text(size)}; at most {size_text(self.bytes)} are installed. No "
@@ -65,7 +65,7 @@ def _number(variable: str, usual: int) -> int:
 
 
 class Watch:
-    """Looks at an installation in progress: at its folder, and at the disks that uv writes to."""
+    """Watches an installation in progress: its folder, and the disks that uv writes to."""
 
     def __init__(self, bounds: Bounds, folder: Path, places: Sequence[Path]) -> None:
         self.bounds = bounds
@@ -77,12 +77,12 @@ class Watch:
         self._announced = 0
 
     def hear(self, line: str) -> None:
-        """Note what uv says that it downloads: a package is no smaller once it is unpacked."""
+        """Count the downloads that uv announces: a package grows when it is unpacked."""
         if match := _ANNOUNCED.fullmatch(line):
             self._announced += int(float(match[2]) * _UNITS[match[3]])
 
     def look(self) -> None:
-        """Refuse to go on over a bound, or where a disk is as good as full."""
+        """Raise ``DependencyError`` if a limit is exceeded or a disk is almost full."""
         self.bounds.check(self._announced, 0, "its packages are downloads of")
         self.bounds.check(*measured(self._folder), "its packages have")
         for place in self._places:
@@ -96,7 +96,7 @@ class Watch:
 
 
 def measured(folder: Path) -> tuple[int, int]:
-    """Bytes and number of all that is below a folder; what vanishes meanwhile counts nothing."""
+    """Returns bytes and number of all entries below a folder; vanished entries count nothing."""
     size = count = 0
     for path in walk(folder):
         try:
@@ -108,7 +108,7 @@ def measured(folder: Path) -> tuple[int, int]:
 
 
 def checked(folder: Path) -> tuple[int, int]:
-    """The same for a folder that does not change. Raises ``DependencyError``."""
+    """Measures a folder that does not change. Raises ``DependencyError`` for special files."""
     for path in walk(folder):
         mode = path.lstat().st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
@@ -120,9 +120,9 @@ def checked(folder: Path) -> tuple[int, int]:
 
 
 def walk(folder: Path) -> Iterator[Path]:
-    """All that is below a folder, links not followed.
+    """Yields all paths below a folder; follows no links.
 
-    Without recursion, as ``os.walk`` has it in older Pythons: a stranger chose how deep it is.
+    Without recursion, unlike ``os.walk`` of older Pythons: a stranger chose the depth.
     """
     waiting = [str(folder)]
     while waiting:

@@ -1,10 +1,10 @@
-"""What a repository declares that it needs, read as data from its verified files.
+"""Reads a repository's declared packages as data from its verified files.
 
 The files are a stranger's. pip and uv obey options, URLs and paths in them, some of which build and
-run code at once, so only plain requirements get through, each parsed and printed anew. The first of
-these that there is counts, as the most particular one: the metadata of a script (PEP 723) in the
+run code at once. So this module accepts only plain requirements, parses each and prints it anew.
+The first existing source counts, the most specific first: the metadata of a script (PEP 723) in the
 entry file, ``requirements.txt`` beside it or else at the root, and ``[project]`` of
-``pyproject.toml``. A requirement may name a repository of git, which is a ``Source``.
+``pyproject.toml``. A requirement may name a git repository, which becomes a ``Source``.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ _GIT = re.compile(
 
 @dataclass(frozen=True)
 class Source:
-    """What was chosen and has no wheel.
+    """A chosen package that has no wheel.
 
     Attributes:
         name: Its canonical name.
-        version: Empty for a repository of git.
-        url: Of the source distribution, or of the repository.
-        sha256: Of the source distribution; empty for git.
-        commit: What a requirement names in a repository: a commit, a tag or a branch; or ``HEAD``.
-        subdirectory: Where the project lies in there.
-        where: The line that asks for it, for errors.
+        version: Empty for a git repository.
+        url: The URL of the source distribution or the repository.
+        sha256: The hash of the source distribution; empty for git.
+        commit: The revision in the requirement: a commit, a tag or a branch; or ``HEAD``.
+        subdirectory: The project's folder in the repository.
+        where: The line that requires the package, for errors.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Source:
 
     @property
     def identity(self) -> str:
-        """What names its content: the hash of a file, or a full commit."""
+        """Identifies the content: the hash of a file, or a full commit."""
         if not self.commit:
             return f"sha256:{self.sha256}"
         below = f"#subdirectory={self.subdirectory}" if self.subdirectory else ""
@@ -65,7 +65,7 @@ class Source:
 
 
 def of_git(requirement: Requirement, where: str) -> Source | None:
-    """The repository that a requirement names; None for what is no ``git+https`` at a revision."""
+    """Returns the repository of a requirement; None unless it is ``git+https`` with a revision."""
     match = _GIT.fullmatch(requirement.url or "")
     if match is None or ".." in match[0]:
         return None
@@ -82,14 +82,14 @@ PROJECT = "pyproject.toml"
 MAX_BYTES = 256 * 1024
 MAX_REQUIREMENTS = 1000
 MAX_FILES = 16
-"""That a ``requirements.txt`` leads to."""
+"""Files that one ``requirements.txt`` may include."""
 MAX_LINE = 2000
 
 _HASH = re.compile(r"--hash[= ](sha256:[0-9a-f]{64}|sha384:[0-9a-f]{96}|sha512:[0-9a-f]{128})")
 _QUOTED = re.compile(r"'[^']*'|\"[^\"]*\"")
 _SCRIPT, _CLOSES = "# /// script", "# ///"
 _LOOKED_AT = 1024 * 1024
-"""Bytes at the beginning of an entry file in which metadata is looked for."""
+"""Bytes at the beginning of an entry file that may hold metadata."""
 _INCLUDES = re.compile(r"(-r|--requirement|-c|--constraint)[ =]\s*(\S+)")
 _ITSELF = re.compile(r"(?:(?:-e|--editable)[ =]\s*)?\./?(?:\[([\w.,\s-]{0,200})\])?")
 _BYTE_ORDER_MARKS = {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
@@ -102,8 +102,8 @@ class WantedPackage:
 
     Attributes:
         requirement: Name, extras, versions and marker; never a URL.
-        where: Where it stands, as in ``"line 2 of requirements.txt"``.
-        hashes: Of its files, as in ``"sha256:..."``; empty where none are given.
+        where: Its position, such as ``"line 2 of requirements.txt"``.
+        hashes: Hashes of its files, such as ``"sha256:..."``; empty if the line has none.
     """
 
     requirement: Requirement
@@ -116,12 +116,12 @@ class WantedPackage:
 
 @dataclass(frozen=True)
 class DeclaredPackages:
-    """What a repository needs.
+    """The packages that a repository declares.
 
     Attributes:
-        wanted: Its requirements; there may be none.
-        python: The versions of Python that it runs in, as in ``">=3.11"``; empty for any.
-        constraints: What holds for packages if something needs them.
+        wanted: Its requirements; may be empty.
+        python: The supported versions of Python, such as ``">=3.11"``; empty for any.
+        constraints: Limits for packages, if something requires these.
     """
 
     source: str
@@ -131,7 +131,7 @@ class DeclaredPackages:
 
 
 def declared(root: Path, entry: str) -> DeclaredPackages | None:
-    """What the files say; None where they say nothing. Raises ``DependencyError``."""
+    """Reads the declared packages; None if no file declares any. Raises ``DependencyError``."""
     script = _script(root / entry, entry)
     if script is not None:
         return script
@@ -146,7 +146,7 @@ def declared(root: Path, entry: str) -> DeclaredPackages | None:
 
 
 def optional(root: Path) -> dict[str, WantedPackage]:
-    """What optional extras of a project bring, by canonical name; empty where none can be read."""
+    """Returns the packages of a project's extras, by canonical name; empty if unreadable."""
     try:
         extras = table(pyproject(root), "project", "optional-dependencies")
         where = f"[project.optional-dependencies] of {PROJECT}"
@@ -157,7 +157,7 @@ def optional(root: Path) -> dict[str, WantedPackage]:
 
 
 def not_read(root: Path, entry: str) -> list[str]:
-    """What says there which packages are needed, in a form that is not read."""
+    """Lists the files that declare packages in a form that this module does not read."""
     beside = (root / entry).parent
     names = [name for name in _NOT_READ if (beside / name).is_file() or (root / name).is_file()]
     try:
@@ -177,7 +177,7 @@ def _unsupported(text: str) -> DependencyError:
 
 
 def parse_requirement(text: str, where: str) -> WantedPackage:
-    """A requirement that somebody wrote, with the hashes behind it. Raises ``DependencyError``."""
+    """Parses a stranger's requirement and the hashes behind it. Raises ``DependencyError``."""
     plain, *hashes = map(str.strip, re.split(r"(?<=\s)(?=--hash[= ])", text))
     if len(plain) > MAX_LINE:
         raise _unsupported(f"{where} has {len(plain)} characters; at most {MAX_LINE} are read")
@@ -203,10 +203,10 @@ def parse_requirement(text: str, where: str) -> WantedPackage:
 
 
 def _is_literal(text: str) -> bool:
-    """Whether it means the same once it has been parsed and printed for uv.
+    """Tells whether a requirement keeps its meaning when it is parsed and printed for uv.
 
-    Texts in markers are read with Python's escapes: one could end its line or its quotes, and what
-    comes then would be a line of its own, which uv obeys.
+    packaging reads texts in markers with Python's escapes: an escape could end its line or its
+    quotes, and the rest would become another line, which uv obeys.
     """
     texts = [quoted[1:-1] for quoted in _QUOTED.findall(text.partition(";")[2])]
     return (
@@ -217,9 +217,9 @@ def _is_literal(text: str) -> bool:
 
 
 def read(root: Path, name: str) -> tuple[list[WantedPackage], list[WantedPackage]]:
-    """The plain requirements in a ``requirements.txt``, and the constraints.
+    """Returns the plain requirements in a ``requirements.txt``, and the constraints.
 
-    Further files of the repository that it names (``-r``, ``-c``) are read, too.
+    Also reads the repository's files that it includes (``-r``, ``-c``).
     """
     wanted: list[WantedPackage] = []
     constraints: list[WantedPackage] = []
@@ -245,7 +245,7 @@ def read(root: Path, name: str) -> tuple[list[WantedPackage], list[WantedPackage
 
 
 def _of_itself(root: Path, extras: str, where: str) -> Iterator[WantedPackage]:
-    """What ``-e .`` brings besides the repository, whose modules are there already."""
+    """Yields the requirements of ``-e .``; the repository's own modules are there already."""
     project = pyproject(root).get("project")
     if not isinstance(project, dict):
         raise _unsupported(
@@ -259,7 +259,7 @@ def _of_itself(root: Path, extras: str, where: str) -> Iterator[WantedPackage]:
 
 
 def _beside(root: Path, file: str, named: str, where: str) -> str:
-    """A file of the repository that another one names, relative to the root."""
+    """Returns the path, relative to the root, of a repository's file that another file names."""
     path = os.path.normpath(os.path.join(os.path.dirname(file), named))
     inside = not os.path.isabs(path) and path.split(os.sep)[0] != ".." and "://" not in named
     if not inside or not _is_file(root / path):
@@ -272,12 +272,12 @@ def _beside(root: Path, file: str, named: str, where: str) -> str:
 def _is_file(path: Path) -> bool:
     try:
         return path.is_file()
-    except (OSError, ValueError):  # a name that there cannot be
+    except (OSError, ValueError):  # a name that no file can have
         return False
 
 
 def _joined(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
-    """Lines without comments, each with the number of its first; a backslash continues one."""
+    """Yields lines without comments and their numbers; a backslash joins a line with the next."""
     parts: list[str] = []
     first = 0
     for number, raw in enumerate(lines, start=1):
@@ -294,7 +294,7 @@ def _joined(lines: Sequence[str]) -> Iterator[tuple[int, str]]:
 
 
 def _script(path: Path, name: str) -> DeclaredPackages | None:
-    """The metadata in an entry file, after https://peps.python.org/pep-0723/."""
+    """Reads the metadata in an entry file, after https://peps.python.org/pep-0723/."""
     try:
         with path.open("rb") as file:
             lines = file.read(_LOOKED_AT).decode("utf-8", "replace").splitlines()
@@ -313,7 +313,7 @@ def _script(path: Path, name: str) -> DeclaredPackages | None:
 
 
 def _block(lines: Sequence[str], start: int) -> str | None:
-    """The text between the opening line and the last closing one of the same comment."""
+    """Returns the text between the opening line and the last closing line of the same comment."""
     inside: list[str] = []
     closed = None
     for line in lines[start + 1 :]:
@@ -333,7 +333,7 @@ def _project(root: Path) -> DeclaredPackages:
 
 
 def pyproject(root: Path, where: str = PROJECT) -> dict[str, Any]:
-    """The whole of ``pyproject.toml``; empty where there is none."""
+    """Returns the content of ``pyproject.toml``; empty if there is no file."""
     path = root / PROJECT
     return _toml(_text(path, where), where) if path.is_file() else {}
 
@@ -365,13 +365,13 @@ def _specifier(found: object, where: str) -> str:
 
 
 def check_versions(asked: str) -> None:
-    """Refuse what is neither a version, nor versions, nor a path. Raises ``ValueError``."""
+    """Raise ``ValueError`` unless a text is a version, a set of versions or a path."""
     if os.sep not in asked:
         versions(asked)
 
 
 def versions(asked: str) -> SpecifierSet:
-    """What a caller asks for: one version, or several; otherwise ``ValueError``."""
+    """Parses a caller's version or set of versions; otherwise raises ``ValueError``."""
     try:
         return SpecifierSet(f"=={Version(asked)}.*" if asked.count(".") < 2 else f"=={asked}")
     except (InvalidVersion, InvalidSpecifier):

@@ -1,17 +1,17 @@
-"""Folders of packages, one for each lock and interpreter: made once, read-only, shared by hash.
+"""Makes folders of packages, one per lock and interpreter: made once, read-only, shared by hash.
 
 ::
 
     <cache>/environments/<key>/
-        environment.json    what it is; its time is that of the last use
+            environment.json    its description; the file's time is that of the last use
         lock.txt            the pins, as uv installed them
         packages/           what uv installed, 0444 in folders 0555, with its bytecode
     <cache>/environments/<key>.lock
 
-A folder is made under another name, by the holder of the lock, and renamed into place: what bears
-a key is complete. Nothing in it is ever run here. It is no environment of any interpreter, so that
-none reads a ``.pth`` or ``sitecustomize`` of it at its start; a jail puts the folder onto its path
-once it is confined.
+The holder of the lock makes a folder under another name and renames it into place: a folder with a
+key as its name is complete. Nothing in it ever runs here. No interpreter has it as an environment,
+so none reads its ``.pth`` or ``sitecustomize`` at the start; a jail adds the folder to its path
+only after it is confined.
 """
 
 from __future__ import annotations
@@ -79,28 +79,28 @@ class Environment:
         return self.home / "packages"
 
     def answers_to(self, name: str) -> bool:
-        """Whether a name means it: at least seven characters of its key."""
+        """Tells whether a name means this environment: at least seven characters of its key."""
         return len(name) >= 7 and self.key.startswith(name)
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What is in it, as plain data."""
+        """Returns its content as plain data."""
         return {"lock": f"sha256:{self.lock}", "packages": list(self.pins)}
 
 
 def root() -> Path:
-    """Where they lie."""
+    """Returns the folder of all environments."""
     return cache_root() / "environments"
 
 
 def key_of(lock: Lock, interpreter: Interpreter) -> str:
-    """The name of the environment for both."""
+    """Returns the name of the environment for a lock and an interpreter."""
     facts = json.dumps([_FORMAT, lock.text, asdict(interpreter)])
     return hashlib.sha256(facts.encode()).hexdigest()[:40]
 
 
 def ready(key: str) -> Environment | None:
-    """The environment of this name, if it has been made. Raises ``DependencyError``."""
+    """Returns the environment of this name if it is complete. Raises ``DependencyError``."""
     environment = _read(root() / key)
     if environment is not None:
         _refuse_shared(environment.home)
@@ -108,9 +108,9 @@ def ready(key: str) -> Environment | None:
 
 
 def provide(lock: Lock, interpreter: Interpreter, tell: Tell = lambda line: None) -> Environment:
-    """The environment for a lock and an interpreter; made if there is none, and marked as used.
+    """Returns the environment for a lock and an interpreter; makes it if needed; marks it as used.
 
-    A second process that asks for the same at once waits for the first.
+    A second process that requests the same environment waits for the first.
     Raises ``DependencyError``.
     """
     key = key_of(lock, interpreter)
@@ -141,7 +141,7 @@ def provide(lock: Lock, interpreter: Interpreter, tell: Tell = lambda line: None
 
 
 def every() -> list[Environment]:
-    """All of them, the latest used first."""
+    """Returns all environments, the latest used first."""
     environments = [_read(record.parent) for record in root().glob(f"[!.]*/{RECORD}")]
     return sorted(
         (environment for environment in environments if environment is not None),
@@ -151,15 +151,15 @@ def every() -> list[Environment]:
 
 
 def remove(environment: Environment) -> str:
-    """Remove one. Not while somebody makes or uses it: then the answer says who, else it is empty.
+    """Removes an unused environment. Returns who makes or uses it, or "" if it is removed.
 
-    A process that starts jails with it, or could, shares the lock of its record.
+    Each process that starts jails with it, or could, shares the lock of its record.
     """
     lock, record = root() / f"{environment.key}.lock", environment.home / RECORD
     gone = root() / f"{BUILDING}{environment.key}-gone"
     try:
         with locks.held(lock), locks.held(record):
-            # another name first: what bears the key is complete, or not there
+            # rename first: a folder with a key as its name is complete
             os.rename(environment.home, gone)
             remove_tree(gone)
             lock.unlink()
@@ -172,17 +172,17 @@ def remove(environment: Environment) -> str:
             "process, or end the process"
         )
     except OSError:
-        return ""  # another has removed it
+        return ""  # another process has removed it
     return ""
 
 
 def half_made() -> list[Path]:
-    """What somebody makes now, or was killed over."""
+    """Returns folders in the making, and those whose maker was killed."""
     return sorted(root().glob(f"{BUILDING}*"))
 
 
 def remove_abandoned() -> None:
-    """Remove what was left half-made by somebody who was killed."""
+    """Remove half-made folders of killed processes."""
     for path in half_made():
         key = path.name.removeprefix(BUILDING).partition("-")[0]
         lock = root() / f"{key}.lock"
@@ -206,7 +206,7 @@ def _read(home: Path) -> Environment | None:
 
 def _made(key: str, lock: Lock, interpreter: Interpreter, held: int, tell: Tell) -> Environment:
     for path in root().glob(f"{BUILDING}{key}-*"):
-        remove_tree(path)  # its maker was killed: we hold what it held
+        remove_tree(path)  # its maker was killed, since we hold its lock
     with draft(root(), f"{BUILDING}{key}-") as building:
         packages = building / "packages"
         watch = Watch(Bounds.set(), building, [index.uv_cache()])
@@ -216,7 +216,7 @@ def _made(key: str, lock: Lock, interpreter: Interpreter, held: int, tell: Tell)
             watch.bounds.check(size, count, "its packages have")
         tell(f"compiling its {size / 2**20:.0f} MiB to bytecode, once")
         _compile(interpreter, packages, held)
-        checked(packages)  # again: a compiler with a fault may leave a link, which chmod follows
+        checked(packages)  # again: a faulty compiler may leave a link, which chmod follows
         _close(packages)
         facts = {
             "format": _FORMAT,
@@ -260,8 +260,8 @@ def _install(
         watch.hear(line)
         tell(line)
 
-    # uv keeps our lock for as long as it lives: if we are killed, no process removes what it still
-    # writes to. Copies, since a file that is shared with uv's cache is another's to change.
+    # uv inherits our lock and holds it until it ends: if we are killed, no process removes files
+    # that uv still writes. Copies, since others may change a file shared with uv's cache.
     uv.run(
         [
             *("pip", "install", *uv.NO_BUILDS, "--require-hashes", "--no-deps"),
@@ -279,9 +279,9 @@ def _install(
 
 
 def _compile(interpreter: Interpreter, packages: Path, held: int) -> None:
-    """Bytecode for all of it, by processes that are confined to the folder (``bytecode.py``).
+    """Compile bytecode for all packages, in processes confined to the folder (``bytecode.py``).
 
-    What fails is only slower, so it is no error.
+    A failure only makes imports slower, so it is no error.
     """
     count = min(_COMPILERS, os.cpu_count() or 1)
     command = [interpreter.path, "-I", "-S", str(_BOOTSTRAP), "bytecode", str(packages)]
@@ -306,7 +306,7 @@ def _compile(interpreter: Interpreter, packages: Path, held: int) -> None:
 
 
 def _close(packages: Path) -> None:
-    """Make it readable for all users, and writable for none."""
+    """Make a folder readable for all users and writable for none."""
     for path in [*walk(packages), packages]:
         mode = path.lstat().st_mode
         runs = stat.S_ISDIR(mode) or mode & stat.S_IXUSR

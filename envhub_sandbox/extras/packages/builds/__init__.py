@@ -1,1 +1,1 @@
-"""Wheels of packages that have none: sources are data here, and built in a jail."""
+"""Builds wheels for packages that have none: reads sources as data, builds them in a jail."""

@@ -1,9 +1,9 @@
-"""Fetches and reads what a stranger has packed, in a process of its own, within one deadline:
+"""Fetches and reads a stranger's archives in a separate process, within one deadline:
 ``python -I -m envhub_sandbox.extras.packages.builds.apart OWNER``.
 
-An archive may hold what takes its reader hours or gigabytes. So the reader is a process that can be
-ended, and its memory has a limit. The order comes as JSON on stdin; the answer, or the error, goes
-to stdout. It ends with the process that started it.
+An archive may cost its reader hours or gigabytes. So the reader is a process that can be ended, and
+its memory is limited. It reads its order as JSON from stdin, writes the answer or the error to
+stdout, and ends with the process that started it.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ if sys.platform == "linux":
     import resource
 
 DEADLINE_S = 1800.0
-"""For the download of a source and its unpacking together; and for a look at a wheel."""
+"""For the download of a source and its unpacking together, or for the check of a wheel."""
 _MEMORY_BYTES = 4 * 2**30
 _SHOWN = 6000
 
 
 def fetch(url: str, sha256: str, archive: Path, tree: Path, title: str) -> Path:
-    """Download and unpack a source distribution into an empty folder; gives its one top folder.
-    ``archive``: where the download lies meanwhile. Raises ``DependencyError``.
+    """Downloads and unpacks a source distribution into an empty folder; returns its top folder.
+    ``archive``: the temporary path of the download. Raises ``DependencyError``.
     """
     order = {"url": url, "sha256": sha256, "archive": str(archive), "tree": str(tree)}
     return Path(_asked({"title": title, **order}, title))
 
 
 def check_wheel(wheel: Path, name: str, version: str, interpreter: Interpreter) -> None:
-    """As ``wheels.check``."""
+    """Runs ``wheels.check`` in a separate process."""
     order = {"wheel": str(wheel), "name": name, "version": version}
     _asked({**order, "interpreter": vars(interpreter)}, f"the wheel of {name}")
 

@@ -1,7 +1,6 @@
-"""From sources to wheels: fetched, unpacked, built in a jail, checked, kept.
+"""Turns sources into wheels: fetches, unpacks, builds in a jail, checks, keeps.
 
-The jail is started by a program of ours (``factory/builder.py``), since packages know nothing of
-sandboxes.
+Our program ``factory/builder.py`` starts the jail, since this package does not depend on sandboxes.
 """
 
 from __future__ import annotations
@@ -43,15 +42,15 @@ _MOST_REQUIRED = 200
 
 
 class BuildFailedError(DependencyError):
-    """The build backend failed, or was ended; the text is what it printed last."""
+    """The build backend failed or was ended; the text is the end of its output."""
 
 
 def _in_jail(order: Mapping[str, Any], folder: Path) -> Path | tuple[str, ...]:
-    """A wheel below an empty folder, or what the build backend needs besides.
+    """Returns a wheel below an empty folder, or the further requirements of the build backend.
 
-    Nothing of either has been looked at: they are a stranger's. The order is read by
-    ``factory/builder.py``; limits, profile and what the jail may read are added here. Raises
-    ``BuildFailedError``, or ``DependencyError`` where there is no jail on this host.
+    Trust: both are a stranger's, unchecked. ``factory/builder.py`` reads the order; this function
+    adds limits, profile and readable folders. Raises ``BuildFailedError``, or ``DependencyError``
+    where this host cannot start a jail.
     """
     answer = _run(order, folder)
     further, name = answer.get("requires"), answer.get("wheel")
@@ -103,7 +102,7 @@ def _run(order: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 Choose = Callable[[PackageRequest, Interpreter, Tell], Lock]
 _DEEPEST = 8
 _ROUNDS = 3
-"""Backends may say what they need besides; once they have it, they may say more."""
+"""Backends may name further requirements; once these are installed, they may name more."""
 _UNDER_WAY: ContextVar[tuple[str, ...]] = ContextVar("sources that are being built", default=())
 _BUILDS: ContextVar[Iterator[int]] = ContextVar("how many were built for one request")
 
@@ -111,11 +110,11 @@ _BUILDS: ContextVar[Iterator[int]] = ContextVar("how many were built for one req
 def build_wheels(
     sources: Sequence[Source], interpreter: Interpreter, tell: Tell, choose: Choose
 ) -> list[Path]:
-    """A wheel of each: kept from before, or built in a jail without network.
+    """Returns a wheel for each source: kept from before, or built in a jail without network.
 
-    ``choose`` gives versions of what they are built with. Raises ``DependencyError`` where one
-    cannot be built, with what is missing here, where sources or a wheel are refused, or where this
-    host has no jail.
+    ``choose`` resolves versions of the build requirements. Raises ``DependencyError`` where a build
+    fails (the text names what this machine lacks), where a check refuses sources or a wheel, or
+    where this host cannot start a jail.
     """
     if not _UNDER_WAY.get():
         _BUILDS.set(itertools.count(1))
@@ -127,10 +126,10 @@ def _wheel(source: Source, interpreter: Interpreter, tell: Tell, choose: Choose)
         source = replace(source, commit=download.resolve(source.url, source.commit))
     kept = wheels.recall(source, interpreter)
     if kept is not None:
-        wheels.named(kept.name, source.name, source.version)  # one commit, asked for as another
+        wheels.named(kept.name, source.name, source.version)  # same commit, other name
         return kept
     with _under_way(source), tempfile.TemporaryDirectory(prefix="envhub-build-") as place:
-        Path(place).chmod(0o755)  # a jail's user is another one
+        Path(place).chmod(0o755)  # the jail runs as another user
         tree = _fetched(source, Path(place), tell)
         declared = project.read(tree, _title(source))
         return _Build(source, declared, tree, Path(place), interpreter, tell, choose).wheel()
@@ -138,7 +137,7 @@ def _wheel(source: Source, interpreter: Interpreter, tell: Tell, choose: Choose)
 
 @contextmanager
 def _under_way(source: Source) -> Iterator[None]:
-    """Refuse a source that is needed to build itself."""
+    """Refuse a source that its own build requires."""
     above = _UNDER_WAY.get()
     chain = (*above, source.name)
     if source.name in above or len(chain) > _DEEPEST:
@@ -159,7 +158,7 @@ def _under_way(source: Source) -> Iterator[None]:
 
 
 def _fetched(source: Source, place: Path, tell: Tell) -> Path:
-    """The folder of its files."""
+    """Fetches the source's files; returns their folder."""
     tree = place / "source"
     tree.mkdir()
     tell(f"fetching the source of {_title(source)}")
@@ -190,7 +189,7 @@ def _title(source: Source) -> str:
 
 @dataclass(frozen=True)
 class _Build:
-    """One source, unpacked."""
+    """The build of one unpacked source."""
 
     _source: Source
     _project: project.Project
@@ -201,7 +200,7 @@ class _Build:
     _choose: Choose
 
     def wheel(self) -> Path:
-        """Built, checked and kept. Raises ``DependencyError``."""
+        """Builds, checks and keeps the wheel. Raises ``DependencyError``."""
         further: tuple[str, ...] = ()
         while True:
             try:
@@ -212,10 +211,10 @@ class _Build:
                 further = (*further, *more)
 
     def _remedy(self, log: str, tried: tuple[str, ...]) -> tuple[str, ...]:
-        """Requirements with which it may be built after all; empty where there are none.
+        """Returns requirements with which a second attempt may succeed; empty if none is known.
 
-        A program that it lacks may come as a wheel. And sources of years ago may not be read by
-        the setuptools of today: then one of theirs is tried.
+        A wheel may bring the program that the build lacked. Today's setuptools may reject old
+        sources: then an older setuptools is tried.
         """
         program = project.wheel_for(log)
         if program and program not in tried:
@@ -240,7 +239,7 @@ class _Build:
         raise BuildFailedError("its backend never has all that it needs")
 
     def _environment(self, further: Iterable[str]) -> tuple[Path, str]:
-        """The folder of what it is built with, and the hash of that one's lock."""
+        """Returns the folder of the build requirements, and the hash of their lock."""
         where = f"what {_title(self._source)} is built with"
         wanted = [*self._project.requires, *(parse_requirement(text, where) for text in further)]
         if not wanted:
@@ -251,7 +250,7 @@ class _Build:
         return environments.provide(lock, self._interpreter, self._tell).packages, lock.digest
 
     def _order(self, packages: Path, known: tuple[str, ...]) -> dict[str, object]:
-        # without ``.git`` nothing else says a version to those that ask git for it
+        # without ``.git``, backends that take the version from git need this variable
         version = {"SETUPTOOLS_SCM_PRETEND_VERSION": f"0+g{self._source.commit[:12]}"}
         return {
             "source": str(self._tree),
@@ -265,7 +264,7 @@ class _Build:
         }
 
     def _runtime(self) -> tuple[str, str]:
-        """What runs the jail's own code: here our own packages, else ones that are made."""
+        """Returns interpreter and packages of the jail's own code: ours, or a new environment."""
         if self._interpreter == interpreters.own():
             return OWN
         lock = self._choose(
@@ -287,9 +286,9 @@ class _Build:
 
 
 def _old_tools(interpreter: Interpreter) -> tuple[str, ...]:
-    """What reads projects that are older than its checks, and brings ``pkg_resources``.
+    """Returns requirements that build older projects and bring ``pkg_resources``.
 
-    Before 66.1 no setuptools runs in Python 3.12.
+    No setuptools before 66.1 runs in Python 3.12.
     """
     old = tuple(map(int, interpreter.version.split(".")[:2])) < (3, 12)
     return ("setuptools<66" if old else "setuptools<81", "wheel<0.40")

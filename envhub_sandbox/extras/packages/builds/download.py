@@ -1,6 +1,6 @@
-"""Brings sources of packages, as data: one file of a known hash, or the files of a commit of git.
+"""Downloads sources of packages as data: one file of a known hash, or the files of a git commit.
 
-The index, its logins, certificates and proxies are those of the user's settings for uv and pip.
+The user's settings for uv and pip give the index, its logins, certificates and proxies.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _INDEXES = ("UV_DEFAULT_INDEX", "UV_INDEX", "UV_INDEX_URL", "UV_EXTRA_INDEX_URL"
 
 
 def download(url: str, sha256: str, target: Path) -> None:
-    """Write the file of a URL, if it is there, not too large, and of this hash."""
+    """Download a URL to a file; refuse a missing file, too large a file or another hash."""
     shown = without_login(url)
     digest = hashlib.sha256()
     try:
@@ -64,7 +64,7 @@ def download(url: str, sha256: str, target: Path) -> None:
 def _opened(url: str) -> IO[bytes]:
     parts = urlsplit(url)
     if parts.scheme == "file" or not parts.scheme:
-        path = Path(unquote(parts.path))  # of a folder that the user has named
+        path = Path(unquote(parts.path))  # of a folder that the user has named in a setting
         if not path.is_file():
             raise ValueError("it is not a file")
         return path.open("rb")
@@ -73,7 +73,7 @@ def _opened(url: str) -> IO[bytes]:
     settings = index.environment()
     request = urllib.request.Request(without_login(url), headers={"User-Agent": _USER_AGENT})
     if login := login_for(url):
-        # not to where it is redirected
+        # unredirected: a redirect must not carry the login to another host
         request.add_unredirected_header("Authorization", authorization(login))
     context = ssl.create_default_context(cafile=settings.get("SSL_CERT_FILE"))
     lower = {name.lower(): value for name, value in settings.items()}
@@ -96,7 +96,7 @@ def _opened(url: str) -> IO[bytes]:
 
 
 def login_for(url: str) -> tuple[str, str] | None:
-    """That of the URL, of an index on the same host, or of ``.netrc``."""
+    """Returns the login of the URL, of an index on the same host, or of ``.netrc``."""
     settings = index.environment()
     host = _host(url)
     named = " ".join(settings.get(name, "") for name in _INDEXES).split()
@@ -115,15 +115,15 @@ def _host(url: str) -> str:
 
 
 def resolve(url: str, revision: str) -> str:
-    """The full commit that a revision means now; raises ``DependencyError``."""
+    """Returns the full commit that a revision names now; raises ``DependencyError``."""
     with _as_of_a_package():
         return commits.resolve(url, revision, index.environment())
 
 
 def check_out(url: str, commit: str, folder: Path, tell: Tell) -> None:
-    """Write the files of a commit below a folder that is there and empty.
+    """Write the files of a commit into an existing, empty folder.
 
-    Links and submodules are left out, and named to ``tell``. Raises ``DependencyError``.
+    Skips links and submodules, and names them to ``tell``. Raises ``DependencyError``.
     """
     title = f"{url}@{commit[:12]}"
     with _as_of_a_package(), commits.fetched(url, commit, index.environment()) as found:

@@ -1,4 +1,4 @@
-"""How sources say that they are built (PEP 517, 518), read as data, and what a build lacked."""
+"""Reads a project's build settings (PEP 517, 518) as data, and tells what a failed build lacked."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _MOST = 200
 
 @dataclass(frozen=True)
 class Project:
-    """What it is built with: packages, the backend (``module:object``), and folders of the sources
-    that the backend is looked for in first.
+    """The build settings: packages, the backend (``module:object``), and the folders of the sources
+    that Python searches first for the backend.
     """
 
     requires: tuple[WantedPackage, ...]
@@ -26,7 +26,7 @@ class Project:
 
 
 def read(tree: Path, title: str) -> Project:
-    """What the sources say; where they say nothing, setuptools builds them."""
+    """Reads the build settings; without settings, setuptools builds the sources."""
     where = f"[build-system] of {title}"
     build_system = pyproject(tree, where).get("build-system", {})
     if not isinstance(build_system, dict):
@@ -70,7 +70,7 @@ _PROGRAMS = {
     "git": "git",
 }
 _WHEELS = {"cmake": "cmake<4", "ninja": "ninja", "swig": "swig<5"}
-"""Those that PyPI has as wheels; CMake as old projects read it."""
+"""Build programs that PyPI has as wheels; CMake in a version that reads old projects."""
 _HEADERS = {
     "Python.h": "python3-dev",
     "linux/input.h": "linux-libc-dev",
@@ -102,12 +102,12 @@ _NETWORK = re.compile(
 
 
 def wheel_for(log: str) -> str:
-    """The package whose wheel brings the program that a build lacked; empty where none does."""
+    """Returns the package whose wheel brings the missing program; empty if there is no wheel."""
     return _WHEELS.get(_program(log), "")
 
 
 def advice(log: str) -> str:
-    """What to install or to do, as one sentence; empty where nothing is recognised."""
+    """Returns one sentence: what to install or to do; empty for an unknown failure."""
     if program := _program(log):
         return f"It needs {program}, which is not found here. {_install(_PROGRAMS[program])}"
     if _COMPILERS.search(log):

@@ -1,9 +1,9 @@
-"""A folder of a stranger's source files: written file by file, within bounds, without links.
+"""Writes a stranger's source files to a folder: file by file, within bounds, without links.
 
-Source distributions and commits of git both come as ``Member``s, which ``write_tree`` writes.
+Source distributions and git commits both come as ``Member``s, which ``write_tree`` writes.
 
-A tar is read by a reader of our own, forwards and once: Python's follows what headers say, also
-backwards where a size is below zero, and unpacks a file from its start for each step back.
+Our own reader reads a tar once, forwards: Python's follows the headers, also backwards where a size
+is negative, and unpacks a file from its start for each step back.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ from envhub_sandbox.system import folders
 from envhub_worker.protocol.text import size_text
 
 MAX_BYTES = 2 * 2**30
-"""Of all files of one source, unpacked."""
+"""Of all unpacked files of one source."""
 MAX_FILES = 50_000
 AT_ONCE = 2**20
-"""The most that is read at once: an extended header says its own length."""
+"""The most bytes of one read: an extended header states its own length."""
 MAX_TABLE = 16 * 2**20
 """Of a zip's table of contents."""
 _PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""How members of a zip may be packed: Python unpacks other ways whole, whatever it is asked for."""
+"""Compression methods of a zip: Python unpacks members of other methods whole, at any read."""
 _LEAST_HEADER = 30
 """Bytes in a zip before each member."""
 _FAR = 2 * MAX_BYTES
 _BROKEN = (OSError, EOFError, ValueError, zlib.error, tarfile.TarError, zipfile.BadZipFile)
-_BROKEN_ZIP = (RuntimeError, NotImplementedError)  # it is encrypted, or compressed in another way
+_BROKEN_ZIP = (RuntimeError, NotImplementedError)  # encrypted, or compressed by another method
 
 _TARS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".tgz": gzip.open, ".bz2": bz2.open}
 
 
 @dataclass(frozen=True)
 class Member:
-    """A regular file that is to be written; ``open`` gives a stream of its bytes, which may have to
-    be read before the next member is asked for.
+    """A regular file to write; ``open`` returns a stream of its bytes, which the caller may have to
+    read before it takes the next member.
     """
 
     path: str
@@ -62,8 +62,8 @@ class Member:
 
 
 def write_tree(members: Iterable[Member], folder: Path, title: str) -> None:
-    """Write files below a folder that is there and empty; within bounds, under names that stay in
-    it. They have numbers beside it until all names are known.
+    """Write files into an existing, empty folder, within bounds and under names that stay in it.
+    Until all names are known, the files lie beside the folder under numbers.
     """
     with tempfile.TemporaryDirectory(prefix="unpacked-", dir=folder.parent) as numbered:
         kept = []
@@ -100,7 +100,7 @@ def _bounded(members: Iterable[Member], title: str) -> Iterator[Member]:
 
 
 def unpack_tree(archive: Path, folder: Path, title: str) -> Path:
-    """Unpack a source distribution below a folder, as ``write_tree``; gives its one top folder."""
+    """Unpacks a source distribution like ``write_tree``; returns its one top folder."""
     try:
         with _members(archive, title) as members:
             write_tree(members, folder, title)
@@ -130,7 +130,7 @@ def _members(archive: Path, title: str) -> Iterator[Iterator[Member]]:
 
 
 class BoundedStream(io.RawIOBase):
-    """A file that refuses to be read far, or much at once: an archive says its own lengths."""
+    """A file with bounds on the position and on one read: an archive states its own lengths."""
 
     def __init__(self, stream: IO[bytes], title: str, at_once: int = AT_ONCE) -> None:
         self._stream = stream
@@ -138,7 +138,7 @@ class BoundedStream(io.RawIOBase):
         self._at_once = at_once
 
     def read(self, size: int = -1) -> bytes:
-        """At most so many bytes; all that are left are few, too."""
+        """Reads at most ``size`` bytes; a read of the whole rest is bounded too."""
         self._check(0 if size < 0 else size, self._at_once)
         self._check(self._stream.tell(), _FAR)
         found = self._stream.read(self._at_once + 1 if size < 0 else size)
@@ -146,16 +146,16 @@ class BoundedStream(io.RawIOBase):
         return found
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """As of every file."""
+        """Seek like any file, within the bound."""
         self._check(offset, _FAR)
         return self._stream.seek(offset, whence)
 
     def tell(self) -> int:
-        """Where it is."""
+        """Returns the position."""
         return self._stream.tell()
 
     def seekable(self) -> bool:
-        """Always."""
+        """Always true."""
         return True
 
     def _check(self, count: int, most: int) -> None:
@@ -164,8 +164,8 @@ class BoundedStream(io.RawIOBase):
 
 
 class _ForwardStream:
-    """A stream that is read once, to its end at the furthest, and not far.
-    ``at``: how much of it has been read.
+    """A stream that is read once and forwards, up to a bound.
+    ``at``: the number of bytes read so far.
     """
 
     def __init__(self, stream: IO[bytes], title: str) -> None:
@@ -174,7 +174,7 @@ class _ForwardStream:
         self.at = 0
 
     def take(self, size: int, *, may_end: bool = False) -> bytes:
-        """The next so many bytes; none at the end, where that may be here."""
+        """Returns the next ``size`` bytes; none at the end, if the stream may end here."""
         if size > AT_ONCE or self.at + size > _FAR:
             raise DependencyError(f"{self._title} is too large to be unpacked", reason="size")
         found = self._stream.read(size)
@@ -184,18 +184,18 @@ class _ForwardStream:
         return found
 
     def skip_to(self, end: int) -> None:
-        """Pass over what is before that."""
+        """Skip the bytes before a position."""
         while self.at < end:
             self.take(min(AT_ONCE, end - self.at))
 
     def part(self, size: int, start: int) -> IO[bytes]:
-        """A stream of the next bytes, as long as they are the next."""
+        """Returns a stream of the next ``size`` bytes; valid until this stream moves on."""
         assert self.at == start, "members are read in their order"
         return io.BufferedReader(_Part(self, size))
 
 
 class _Part(io.RawIOBase):
-    """So many bytes of a stream."""
+    """The next ``size`` bytes of a stream."""
 
     def __init__(self, stream: _ForwardStream, size: int) -> None:
         self._stream = stream
@@ -221,7 +221,7 @@ _RECORD = re.compile(rb"(\d{1,7}) ([^=]+)=")
 def _of_tar(stream: _ForwardStream, title: str) -> Iterator[Member]:
     said: dict[str, str] = {}
     for count in itertools.count():
-        if count > 4 * MAX_FILES:  # a folder and a file, with a header for each
+        if count > 4 * MAX_FILES:  # an entry has up to two headers, and a file may have a folder
             raise DependencyError(f"{title} has more than {MAX_FILES} files", reason="size")
         block = stream.take(_TAR_BLOCK, may_end=count > 0)
         if not block.strip(b"\0"):
@@ -237,14 +237,14 @@ def _of_tar(stream: _ForwardStream, title: str) -> Iterator[Member]:
             yield Member(path, size, bool(header.mode & stat.S_IXUSR), opened)
             said = {}
         elif header.type == tarfile.DIRTYPE:
-            said, end = {}, start  # its size is no length
+            said, end = {}, start  # no data follows the header of a folder
         else:
             raise _no_file(title, said.get("path", header.name))
         stream.skip_to(end)
 
 
 def _size_of(header: tarfile.TarInfo, said: dict[str, str], title: str) -> int:
-    """The bytes behind a header; of a file, what the header before it may have said."""
+    """Returns the size of a header's data; a preceding extended header overrides a file's size."""
     size = said.get("size", "") if header.type in _REGULAR else ""
     if header.size < 0 or not re.fullmatch(r"[0-9]{0,20}", size):
         raise not_as_expected(f"{title} holds {header.name[:200]!r}, of which the size is none")
@@ -252,7 +252,7 @@ def _size_of(header: tarfile.TarInfo, said: dict[str, str], title: str) -> int:
 
 
 def _said(kind: bytes, data: bytes, title: str) -> dict[str, str]:
-    """What a header says of the one that follows. For all that follow, none decides anything."""
+    """Returns the fields that an extended header sets for the next header; ignores global ones."""
     if kind in _LONG:
         name = data.partition(b"\0")[0].decode("utf-8", "surrogateescape")
         return {_LONG[kind]: name}
@@ -273,7 +273,7 @@ def _said(kind: bytes, data: bytes, title: str) -> dict[str, str]:
 
 
 def check_zip(members: Sequence[zipfile.ZipInfo], title: str) -> None:
-    """Refuse what is no file or folder, what Python unpacks whole, and what lies in another."""
+    """Refuse special files, members that Python unpacks whole, and members that overlap."""
     end = 0
     for member in sorted(members, key=attrgetter("header_offset")):
         kinds = (0, stat.S_IFREG, *([stat.S_IFDIR] if member.is_dir() else []))
@@ -301,7 +301,7 @@ def _of_zip(archive: zipfile.ZipFile, title: str) -> Iterator[Member]:
 
 
 def not_as_expected(text: str) -> DependencyError:
-    """The error for a package that is not what its hashes or its index say."""
+    """Builds the error for a package that contradicts its hashes or its index."""
     return DependencyError(text, reason="integrity")
 
 

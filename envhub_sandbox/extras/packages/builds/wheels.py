@@ -1,8 +1,8 @@
-"""Wheels that came out of a jail: looked at as at any stranger's bytes, and then kept.
+"""Checks wheels that came out of a jail as any stranger's bytes, and keeps them.
 
-Each is the package that was asked for, fits the interpreter, and holds what its RECORD says: files
-with these hashes, no links, nothing that leads out of a folder. What it does once it is installed
-is a jail's matter, as with every wheel of an index. They are kept by what they were built of::
+A wheel must be the requested package, fit the interpreter, and contain exactly the files that its
+RECORD lists with their hashes, no links, and no path that leaves its folder. The jail confines the
+installed code, as for every wheel of an index. The cache sorts wheels by what they were built of::
 
     <cache>/wheels/<source and interpreter>/<build environment>/
         NAME-VERSION-TAGS.whl
@@ -62,8 +62,8 @@ _UNREADABLE = (
 
 @dataclass(frozen=True)
 class WheelOrigin:
-    """What a wheel was built of: its source, the digest of the lock of the packages that it was
-    built with, and its own SHA-256.
+    """The origin of a built wheel: its source, the digest of the lock of its build requirements,
+    and its own SHA-256.
     """
 
     source: Source
@@ -72,9 +72,9 @@ class WheelOrigin:
 
 
 def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> None:
-    """Refuse a wheel, under the name that its builder gave it, that is not what was asked for.
+    """Refuse a wheel, under the name from its builder, that is not the requested package.
 
-    An empty version stands for any. Raises ``DependencyError``.
+    An empty version accepts any. Raises ``DependencyError``.
     """
     try:
         version_found = named(wheel.name, name, version)
@@ -97,7 +97,7 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
 
 
 def named(file: str, name: str, version: str) -> Version:
-    """The version of a wheel, by the name of its file. Raises ``DependencyError``."""
+    """Returns the version in a wheel's file name. Raises ``DependencyError``: it is another one."""
     try:
         distribution, number, _, _ = parse_wheel_filename(file)
         wanted = Version(version) if version else number
@@ -126,13 +126,13 @@ def _files(archive: zipfile.ZipFile) -> None:
     if len(members) > MAX_FILES or sum(member.file_size for member in members) > MAX_UNPACKED:
         raise not_as_expected(f"it holds more than {MAX_FILES} files or {size_text(MAX_UNPACKED)}")
     check_zip(members, "it")
-    # a folder as a file in it
+    # so that a folder collides with a file of the same name
     names = (member.filename + "_" * member.is_dir() for member in members)
     check_listing_names([FileRecord(name, 0, "") for name in names], "it")
 
 
 def _info(archive: zipfile.ZipFile, name: str, version: Version) -> str:
-    """Its one ``.dist-info``, which is that of the package and of the version."""
+    """Returns the wheel's only ``.dist-info`` folder; its name must match package and version."""
     tops = {name.partition("/")[0] for name in archive.namelist()}
     folders_found = [top for top in tops if top.endswith(".dist-info")]
     if len(folders_found) != 1:
@@ -149,7 +149,7 @@ def _info(archive: zipfile.ZipFile, name: str, version: Version) -> str:
 
 
 def _fields(data: bytes) -> dict[str, str]:
-    """The headers of METADATA; of each name the first."""
+    """Returns the headers of METADATA; of repeated names the first."""
     fields: dict[str, str] = {}
     for line in data.decode("utf-8", "replace").splitlines():
         if not line.strip():
@@ -169,7 +169,7 @@ def _small(archive: zipfile.ZipFile, path: str) -> bytes:
 
 
 def _record(archive: zipfile.ZipFile, path: str) -> None:
-    """Every file is in RECORD with its hash, and RECORD names no other."""
+    """Require RECORD to list every file with its hash, and no other file."""
     rows = list(csv.reader(io.StringIO(_small(archive, path).decode())))
     said = {row[0]: row[1] for row in rows if len(row) == 3}
     there = {member.filename for member in archive.infolist() if not member.is_dir()}
@@ -183,22 +183,22 @@ def _record(archive: zipfile.ZipFile, path: str) -> None:
 
 def _digest(archive: zipfile.ZipFile, name: str) -> str:
     digest = hashlib.sha256()
-    with archive.open(name) as file:  # which gives no more than it says
+    with archive.open(name) as file:  # it reads no more bytes than the size in the directory
         copy_bounded(file, None, archive.getinfo(name).file_size, digest)
     return "sha256=" + base64.urlsafe_b64encode(digest.digest()).rstrip(b"=").decode()
 
 
 FORMAT = 2
-"""Of what is kept, and of how it is built: another one is built again."""
+"""The format of kept wheels and of their build; wheels of another format are built again."""
 
 
 def root() -> Path:
-    """Where they lie; ours alone, since what lies there is installed."""
+    """Returns the folder of kept wheels; private to this user, since we install these wheels."""
     return cache_root() / "wheels"
 
 
 def recall(source: Source, interpreter: Interpreter) -> Path | None:
-    """The wheel of a source that was built last for an interpreter; None where there is none."""
+    """Returns the latest kept wheel of a source for an interpreter; None if there is none."""
     folder = root() / _key(source, interpreter)
     if not folder.is_dir() or not folders.is_ours_alone(root()):
         return None
@@ -207,7 +207,7 @@ def recall(source: Source, interpreter: Interpreter) -> Path | None:
 
 
 def _whole(record: Path) -> Path | None:
-    """The wheel beside a record, if it is what that one says."""
+    """Returns the wheel beside a record if its hash matches the record."""
     with contextlib.suppress(OSError, ValueError, HashMismatch):
         [wheel] = record.parent.glob("*.whl")
         built = describe(wheel)
@@ -220,7 +220,7 @@ def _whole(record: Path) -> Path | None:
 
 @dataclass(frozen=True)
 class KeptWheel:
-    """A wheel that was built here; ``used``: Unix time (seconds) when it was last asked for."""
+    """A wheel that was built here; ``used``: Unix time (seconds) of its last use."""
 
     file: str
     size: int
@@ -228,18 +228,18 @@ class KeptWheel:
     home: Path
 
     def answers_to(self, name: str) -> bool:
-        """Whether a name means it: its file's, or that of its package."""
+        """Tells whether a name is the name of this wheel's file or of its package."""
         return name == self.file or canonicalize_name(name) == parse_wheel_filename(self.file)[0]
 
     def remove(self) -> None:
-        """It is built again where it is needed."""
+        """Remove the wheel; the next request builds it again."""
         remove_tree(self.home)
-        with contextlib.suppress(OSError):  # of another build environment there is one more
+        with contextlib.suppress(OSError):  # it may hold a wheel of another build
             self.home.parent.rmdir()
 
 
 def every() -> list[KeptWheel]:
-    """All of them, the latest used first."""
+    """Returns all kept wheels, the latest used first."""
     wheels = []
     for record in root().glob("*/[!.]*/built.json"):
         with contextlib.suppress(OSError, ValueError):
@@ -251,7 +251,7 @@ def every() -> list[KeptWheel]:
 
 
 def describe(wheel: Path) -> WheelOrigin | None:
-    """What a wheel was built of; None for one that was not built here."""
+    """Returns the origin of a wheel; None for a wheel that was not built here."""
     with contextlib.suppress(OSError, ValueError, TypeError, LookupError):
         facts = json.loads((wheel.parent / "built.json").read_bytes())
         return WheelOrigin(Source(**facts["source"]), facts["environment"], facts["wheel"])
@@ -259,7 +259,7 @@ def describe(wheel: Path) -> WheelOrigin | None:
 
 
 def keep(wheel: Path, source: Source, environment: str, interpreter: Interpreter) -> Path:
-    """Keep a wheel that was checked, and return where it lies. Raises ``DependencyError``."""
+    """Keeps a checked wheel; returns its path. Raises ``DependencyError``."""
     folder = root() / _key(source, interpreter)
     public = replace(source, url=without_login(source.url), where="")
     built = WheelOrigin(public, environment, _hash(wheel).removeprefix("sha256:"))
@@ -272,7 +272,7 @@ def keep(wheel: Path, source: Source, environment: str, interpreter: Interpreter
             home = folder / environment[:40]
             if home.exists() and _whole(home / "built.json") is None:
                 remove_tree(home)
-            with contextlib.suppress(OSError):  # one that another has put there is as good
+            with contextlib.suppress(OSError):  # a wheel of another process serves as well
                 os.rename(building, home)
     except OSError as error:
         raise DependencyError(f"{root()} cannot be written: {error}") from error
