@@ -1,1 +1,1 @@
-"""A repository's packages: what it declares, resolved and installed without running any of it."""
+"""Resolves and installs a repository's declared packages without running any of its code."""

@@ -1,15 +1,15 @@
-"""The program by which ``envhub-worker listen --dependencies`` makes clients' packages.
+"""Makes clients' packages for ``envhub-worker listen --dependencies``.
 
 ``python -I -m envhub_sandbox.extras.packages.for_a_server --server-pidfd=N``: stdin is one order as
-JSON, stdout a file that holds the present state, as one object of JSON: ``progress``, a line for
-people; and at the end ``own``, ``made``, or ``error`` and ``said``. With the word ``check`` it only
-says whether it could work.
+JSON; stdout is a file with the present state as one JSON object: ``progress``, a line for people,
+and at the end ``own``, ``made``, or ``error`` and ``said``. With the word ``check`` it only reports
+whether it could work.
 
-An order comes from a client on another host, and nothing of it is believed: requirements are
-read as a stranger's file is. What is made lies in a folder of that client's key, uv's cache
-included, and all of it has one bound. So two processes are at it: one works, and this one measures,
-ends it, and leaves nothing of what was not finished. Each has a pidfd of the one that started it,
-and ends with it, also where that was killed: the work would be neither measured nor waited for.
+Trust: an order comes from a client on another host; its requirements are read like a stranger's
+file. All packages and uv's cache lie in a folder of the client's key, under one bound. Two
+processes share the task: a maker works, and this watcher measures it, ends it and removes what it
+left unfinished. Each has a pidfd of its parent and ends with it, even if the parent is killed:
+otherwise nobody would measure the maker or wait for it.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from envhub_sandbox.system.platform import end_with, pidfd, program
 from envhub_worker.protocol.text import printable
 
 BLOCK_BYTES = 4096
-"""What the smallest file is charged: it takes disk, too."""
+"""The charge of the smallest file, since each takes at least a block of the disk."""
 _LOOK_S = 0.5
 _WAIT_S = 60.0
 _LOCKED_S = 1800.0
-"""For so long another server of this machine may be at work, where both share the folder."""
+"""How long another server of this machine may work, if both share the folder."""
 _CLEANING_S = 2 * _WAIT_S
 _WHERE_CHARS = 200
 _SAID_CHARS = 3800
@@ -55,7 +55,7 @@ _PIDFD = "--server-pidfd="
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Carry out an order; the exit code is 0 if something was said that can be read."""
+    """Carries out an order; returns 0 if it wrote a readable answer."""
     words = sys.argv[1:] if words is None else words
     try:
         if "check" in words:
@@ -83,18 +83,18 @@ def _say(what: Mapping[str, Any]) -> None:
     os.pwrite(1, json.dumps(what).encode(), 0)
 
 
-# --- who works ----------------------------------------------------------------------------------
+# --- the maker ----------------------------------------------------------------------------------
 
 
 def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     if ended is not None:
         end_with(ended, 0.0)  # uv is in our group, too
     os.nice(_NICE)
-    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)  # which a plain user cannot raise
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)  # a plain user cannot raise it
     bound = order["bytes"] if most == resource.RLIM_INFINITY else min(order["bytes"], most)
     resource.setrlimit(resource.RLIMIT_FSIZE, (bound, bound))
     request = _request(order)
-    # a client could have it ask any host that it reaches, and what a build takes is in no account
+    # a client could have a build contact any host, and no account covers the costs of builds
     resolutions.BUILDER = None
     if not request.always and packages.HERE.meets(request):
         return {"own": True}
@@ -112,7 +112,7 @@ def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
 
 
 def _request(order: Mapping[str, Any]) -> PackageRequest:
-    """What is asked for. Trust: input from a client."""
+    """Reads the request from an order. Trust: input from a client."""
     python, until = order["python"], order["exclude_newer"]
     try:
         check_versions(python or ">=3")
@@ -148,11 +148,11 @@ def _wanted(rows: Iterable[Sequence[str]]) -> tuple[WantedPackage, ...]:
     return tuple(parse_requirement(text, printable(where, _WHERE_CHARS)) for text, where in rows)
 
 
-# --- who watches --------------------------------------------------------------------------------
+# --- the watcher --------------------------------------------------------------------------------
 
 
 def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
-    """Have it made, within bounds; empty where the process that made it has written the answer."""
+    """Has the packages made within bounds; returns {} if the maker has written the answer."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     if ended is not None:
         end_with(ended, _CLEANING_S)
@@ -175,13 +175,13 @@ def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
 
 
 def _worked(order: Mapping[str, Any], held: int) -> bool:
-    """Whether it has come to an end that leaves nothing half-made."""
+    """Runs the maker; tells whether it ended without leaving anything half-made."""
     with pidfd() as ourselves:
         process = subprocess.Popen(
             [*program(_PROGRAM), "make", f"{_PIDFD}{ourselves}"],
             stdin=subprocess.PIPE,
             pass_fds=(held, ourselves),
-            start_new_session=True,  # uv is in it, too
+            start_new_session=True,  # a group of its own, which includes uv
         )
     try:
         assert process.stdin is not None
@@ -212,7 +212,7 @@ def _look(order: Mapping[str, Any]) -> None:
 
 
 def _charged(folder: Path) -> int:
-    """Bytes of all that is below a folder, a block at least for each file."""
+    """Returns the bytes of all files below a folder, at least a block for each."""
     total = 0
     for path in bounds.walk(folder):
         with contextlib.suppress(OSError):
@@ -222,7 +222,7 @@ def _charged(folder: Path) -> int:
 
 @contextlib.contextmanager
 def _alone(folder: Path) -> Iterator[int]:
-    """Hold the lock of a client's folder: a killed server may have left a process there."""
+    """Hold the lock of a client's folder: a killed server may have left a maker there."""
     folder.mkdir(parents=True, exist_ok=True)
 
     waits = {"progress": "waiting for another process, which makes packages there"}
@@ -240,9 +240,9 @@ def _uv_cache(order: Mapping[str, Any]) -> Path:
 
 
 def _clean(order: Mapping[str, Any]) -> None:
-    """Remove what was not finished, and all that uv has unpacked: some of it may be what broke.
+    """Remove unfinished folders and uv's cache, where an unpacked package may be damaged.
 
-    A uv that was killed a moment ago still holds its lock until the kernel has ended it.
+    A uv that was killed a moment ago holds its lock until the kernel has ended it.
     """
     until = time.monotonic() + _WAIT_S
     while True:
@@ -255,7 +255,7 @@ def _clean(order: Mapping[str, Any]) -> None:
 
 
 def _make_room(order: Mapping[str, Any]) -> None:
-    """Half of the bound at least is for what comes: what was not used for longest goes."""
+    """Keep at least half of the bound free for new packages: remove the longest unused ones."""
     folder, keep = Path(order["folder"]), frozenset[str](order["keep"])
     if _charged(folder) > order["bytes"] // 2:
         remove_tree(_uv_cache(order))

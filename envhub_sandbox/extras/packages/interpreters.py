@@ -1,10 +1,10 @@
-"""Interpreters that a repository can run in, and whether what is installed there is enough.
+"""Finds interpreters that a repository can run in, and checks their installed packages.
 
-None is downloaded unless the caller permits it (``fetch_python``); then uv does. Nothing is
-imported: what is installed says its metadata.
+uv downloads an interpreter only if the caller permits it (``fetch_python``). This module imports no
+package: it reads the metadata of installed ones.
 
-A repository's packages lie in a folder of their own, so what is wanted is an interpreter and
-nothing of its packages: the one that a virtual environment was made of, and not the environment.
+A repository's packages lie in their own folder, so it needs an interpreter without packages: the
+base interpreter of a virtual environment, not the environment.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _ASK = (
 
 @dataclass(frozen=True)
 class Interpreter:
-    """An interpreter, without its packages, by its absolute path, which is no link."""
+    """An interpreter without its packages, by its absolute path, links resolved."""
 
     path: str
     implementation: str
@@ -57,16 +57,16 @@ class Interpreter:
 
     @property
     def series(self) -> str:
-        """Which wheels it takes: ``"cpython 3.11"``."""
+        """Returns the kind of wheels that it takes: ``"cpython 3.11"``."""
         return f"{self.implementation} {'.'.join(self.version.split('.')[:2])}"
 
     def fits(self, versions: SpecifierSet) -> bool:
-        """Whether it is among these versions."""
+        """Tells whether its version is among these versions."""
         return versions.contains(self.version, prereleases=True)
 
 
 def own() -> Interpreter:
-    """The one that this process runs in; what it was made of, if it is a virtual environment."""
+    """Returns this process's interpreter, or the base interpreter of its virtual environment."""
     name = f"python{sys.version_info[0]}.{sys.version_info[1]}"
     base = os.path.realpath(os.path.join(sys.base_prefix, "bin", name))
     if not os.access(base, os.X_OK):
@@ -81,15 +81,15 @@ def own() -> Interpreter:
 
 
 def release(version: str) -> str:
-    """A version of Python as one that can be compared: built from a checkout it ends in a plus."""
+    """Makes a version of Python comparable: a build from a checkout ends in a plus."""
     return version.rstrip("+")
 
 
 def find(python: str, declared: str = "", *, fetch: bool = False) -> Interpreter:
-    """An interpreter that fits: this one if it does, else the newest that is at hand.
+    """Returns a fitting interpreter: this process's if it fits, else the newest on this machine.
 
-    The caller may ask for a version (``"3.11"``), versions (``">=3.11,<3.13"``) or a path; the
-    repository declares versions. Where none is at hand uv may ``fetch`` one.
+    The caller may name a version (``"3.11"``), versions (``">=3.11,<3.13"``) or a path; the
+    repository declares versions. If none fits, uv may ``fetch`` an interpreter.
     """
     if os.sep in python:
         return _at(os.path.abspath(os.path.expanduser(python)))
@@ -115,7 +115,7 @@ def find(python: str, declared: str = "", *, fetch: bool = False) -> Interpreter
 
 
 def others(declared: str, first: Interpreter) -> list[Interpreter]:
-    """The other releases on this machine that a repository may run in, the newest first."""
+    """Returns the other fitting Python releases on this machine, the newest first."""
     interpreters = _others(SpecifierSet(declared) & _OLDEST)
     return [version for version in interpreters if version.series != first.series]
 
@@ -144,11 +144,11 @@ def _at(path: str) -> Interpreter:
 
 
 def _others(wanted: SpecifierSet) -> list[Interpreter]:
-    """What uv finds, and what pyenv keeps where uv does not look; one of each series."""
+    """Returns one interpreter of each series, from uv and from pyenv's folder."""
     root = os.environ.get("PYENV_ROOT") or os.path.expanduser("~/.pyenv")
-    # which may be another user's; this glob finds nothing where it may not look
+    # the folder may be another user's; glob yields nothing for an unreadable folder
     paths = glob.glob(f"{glob.escape(root)}/versions/3.*/bin/python3")
-    # its shims are no interpreters, but uv would start every one, each time
+    # pyenv's shims are no interpreters, but uv would start each of them every time
     searched = os.environ.get("PATH", os.defpath).split(os.pathsep)
     search = os.pathsep.join(path for path in searched if os.path.basename(path) != "shims")
     try:
@@ -160,7 +160,7 @@ def _others(wanted: SpecifierSet) -> list[Interpreter]:
         )
         paths += [str(row["path"]) for row in json.loads(answer) if _may_be(row)]
     except (DependencyError, ValueError, LookupError, TypeError):
-        pass  # there is none that uv finds
+        pass  # uv finds no interpreter
     newest: dict[str, Interpreter] = {}
     for one in sorted(_answering(paths), key=lambda one: Version(one.version), reverse=True):
         if one.fits(wanted):
@@ -175,12 +175,12 @@ def _answering(paths: Iterable[str]) -> Iterator[Interpreter]:
 
 
 def _may_be(row: dict[str, object]) -> bool:
-    """Whether it is worth asking: 3.14t is another ABI."""
+    """Tells whether a row of uv's list may fit: 3.14t, for example, has another ABI."""
     return (row.get("variant", "default"), row.get("implementation")) == ("default", "cpython")
 
 
 class InstalledPackage(NamedTuple):
-    """A distribution of an interpreter elsewhere: its version, and what it needs."""
+    """A distribution of another interpreter: its version and its requirements."""
 
     version: str
     requires: Sequence[str]
@@ -191,11 +191,11 @@ def first_unmet(
     there: Mapping[str, InstalledPackage] | None = None,
     version: str | None = None,
 ) -> str | None:
-    """The first requirement that an interpreter does not meet, of those asked for or of theirs.
+    """Returns the first unmet requirement, of the request or of a package that it leads to.
 
-    None if it meets them all. Where hashes or a repository are given it never does: the metadata
-    does not say what its packages were made of. The interpreter is this one, unless another's
-    packages (``there``) and version are given.
+    None if all are met. A request with hashes or a git repository is never met: the metadata does
+    not record the origin of packages. The interpreter is this process's, unless the packages
+    (``there``) and the version of another are given.
     """
     python = SpecifierSet(request.supports)
     python_version = version or release(platform.python_version())
@@ -214,7 +214,7 @@ def first_unmet(
 
 
 def brought(requirements: Iterable[Requirement]) -> list[metadata.Distribution]:
-    """What this interpreter has of these, whichever version, and of all that they lead to."""
+    """Returns this interpreter's distributions, of any version, that requirements lead to."""
     return [
         distribution
         for _, distribution in _reached(requirements)
@@ -227,8 +227,8 @@ def _reached(
     there: Mapping[str, InstalledPackage] | None = None,
     version: str = "",
 ) -> Iterator[tuple[Requirement, metadata.Distribution | InstalledPackage | None]]:
-    """Each that applies, of all that they lead to, and what is installed of that name: here, or
-    ``there``, where Python is of that version.
+    """Yields each applicable requirement, also of further packages, and the distribution installed
+    for it: here, or in ``there`` with that version of Python.
     """
     environment = {str(k): str(v) for k, v in default_environment().items()}
     if there is not None:
@@ -243,7 +243,7 @@ def _reached(
         try:
             if not _applies(wanted, extras, environment):
                 continue
-        except (ValueError, LookupError):  # its marker cannot be evaluated, as uv will say
+        except (ValueError, LookupError):  # uv will report the marker
             yield wanted, None
             continue
         key = (canonicalize_name(wanted.name), frozenset(wanted.extras))
@@ -268,7 +268,7 @@ def _distribution(name: str) -> metadata.Distribution | None:
 
 
 def installed_from(name: str) -> str:
-    """The folder that a distribution of this interpreter was installed from; empty for none."""
+    """Returns the folder that a distribution here was installed from; empty if from none."""
     found = _distribution(name)
     with contextlib.suppress(ValueError, LookupError, TypeError):
         facts = json.loads((found.read_text("direct_url.json") if found else None) or "{}")
@@ -287,4 +287,4 @@ def _needs(found: metadata.Distribution | InstalledPackage) -> list[Requirement]
     try:
         return [Requirement(text) for text in found.requires or ()]
     except InvalidRequirement:
-        return []  # of old metadata; what is installed already works for its owner
+        return []  # old metadata; the installed package already works for its owner

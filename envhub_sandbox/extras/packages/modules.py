@@ -1,7 +1,7 @@
-"""The modules that a repository imports: what brings each, and what to do where one is missing.
+"""Finds the modules that a repository imports, the package of each, and advice for missing ones.
 
-Which distribution brings one says its own pyproject.toml, or a table of ours,
-``extras/sources/modules.txt``; never an index: anybody may publish a package under a module's name.
+The repository's pyproject.toml or our table, ``extras/sources/modules.txt``, names the package of a
+module; never an index: anybody may publish a package under a module's name.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _FORMAT = 2
 _READ: dict[tuple[Path, str], tuple[tuple[str, str, int], ...]] = {}
 _MOST = 64
 _MOST_NOTED = 4
-"""Modules noted for a commit: each costs another installation."""
+"""Modules noted for one commit: each costs another installation."""
 _SHOWN = 20
 _LONGEST = 100
 _MISSING = r"No module named '([\w.]+)'"
 _WORKERS = {"cloudpickle", "gymnasium", "msgpack", "numpy", "farama_notifications"}
-"""Modules that are in every jail."""
+"""Modules that every jail has."""
 _GYMNASIUM = (
     (
         r"(Ant|HalfCheetah|Hopper|Humanoid|HumanoidStandup|InvertedDoublePendulum"
@@ -60,14 +60,14 @@ _GYMNASIUM = (
         ("pygame", "gymnasium[toy-text]", "pygame pygame-ce"),
     ),
 )
-"""Extras of Gymnasium by patterns of the ids that need them; ``drawn`` follows an id that is made
-with a ``render_mode``."""
+"""Extras of Gymnasium, by patterns of the ids that need them; ``drawn`` follows an id that the
+repository makes with a ``render_mode``."""
 
 
 @dataclass(frozen=True)
 class Guess:
-    """A module that is imported, with the requirement that brings it (and the place of the import),
-    and the canonical names of distributions, any of which does.
+    """An imported module, the requirement for it (with the place of the import), and the canonical
+    names of the distributions that bring it.
     """
 
     module: str
@@ -76,7 +76,7 @@ class Guess:
 
     @property
     def facts(self) -> dict[str, str]:
-        """For the provenance."""
+        """Returns the entry in the provenance."""
         return {
             "module": self.module,
             "requirement": str(self.wanted.requirement),
@@ -84,14 +84,14 @@ class Guess:
         }
 
     def is_among(self, names: Collection[str]) -> bool:
-        """Whether one of these distributions, by canonical name, brings it."""
+        """Tells whether one of these distributions, by canonical name, brings the module."""
         return not set(self.brought_by).isdisjoint(names)
 
 
 def guessed(snapshot: Snapshot) -> tuple[Guess, ...]:
-    """What a repository imports, as far as it is known what brings it.
+    """Returns guesses for the imported modules whose package is known.
 
-    What its declared packages bring is among it: that is known once versions are chosen.
+    Includes modules that declared packages bring, since these are known only after resolution.
     """
     return _guessed(snapshot.root, read(snapshot))
 
@@ -140,10 +140,10 @@ def _of_module(name: str, extras: Mapping[str, WantedPackage]) -> tuple[str, str
 
 
 def is_here(guess: Guess) -> bool:
-    """Whether a jail in this interpreter can import its module. Nothing is imported.
+    """Tells whether a jail in this interpreter can import a guess's module. Imports nothing.
 
-    A jail does not have what only this process imports from: the folder of its program, the
-    current one, and those of PYTHONPATH.
+    A jail lacks three sources of this process's modules: the program's folder, the current folder,
+    and PYTHONPATH.
     """
     program = getattr(sys.modules.get("__main__"), "__file__", None)
     own = {"", os.getcwd()}
@@ -155,8 +155,8 @@ def is_here(guess: Guess) -> bool:
 
 
 def _path_here(module: str, folders: Sequence[str]) -> str:
-    """Where this process finds a top-level module, as data: no finder is asked but Python's own,
-    since there are finders that install what they are asked for. Empty for nowhere.
+    """Returns the path of a top-level module in this process; empty if there is none. Asks only
+    Python's own finder, since other finders may install the modules that they are asked for.
     """
     mapped = mapped_modules(sys.meta_path).get(module)
     spec = None if mapped else PathFinder.find_spec(module, folders)
@@ -166,7 +166,7 @@ def _path_here(module: str, folders: Sequence[str]) -> str:
 
 
 def _built_on_import(module: str) -> str:
-    """The folder that Meson's finder builds a module in, each time it is imported."""
+    """Returns the folder where Meson's finder builds a module at each import."""
     for finder in sys.meta_path:
         if module in getattr(finder, "_top_level_modules", ()):
             return str(getattr(finder, "_build_path", finder))
@@ -174,12 +174,12 @@ def _built_on_import(module: str) -> str:
 
 
 def read(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
-    """Modules that a repository imports and does not have, and ids of environments; file and line.
+    """Returns imported modules that the repository lacks, and ids of environments; file and line.
 
-    A commit's are remembered: they are read in a process of their own. Not by the snapshot, which
-    lists its files: of many thousands, to be hashed and held.
+    Remembers them by commit, since another process must parse the files. The snapshot is not the
+    key: it lists its files, and thousands of files would be hashed and kept in memory.
     """
-    place = snapshot.root, snapshot.path  # a root holds one commit
+    place = snapshot.root, snapshot.path  # a root holds only one commit
     if place not in _READ:
         if len(_READ) >= _MOST:
             _READ.clear()
@@ -188,10 +188,10 @@ def read(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
 
 
 def note_missing(snapshot: Snapshot, said: str) -> bool:
-    """Remember that a repository's packages import a module, by the text of an error; False where
-    that was known, or it is not known what brings it.
+    """Remember a module that a repository's packages import, by the text of an error; False if it
+    was known, or its package is unknown.
 
-    Trust: text from the worker. It chooses among the modules of our table, as an entry file can.
+    Trust: text from the worker. It selects a module of our table, as an entry file can too.
     """
     from envhub_sandbox.extras.sources.parsing import of_module
 
@@ -208,7 +208,7 @@ def note_missing(snapshot: Snapshot, said: str) -> bool:
 
 
 def _place(snapshot: Snapshot) -> tuple[Path, str]:
-    """The folder and the name of what is remembered of a commit."""
+    """Returns the folder and the file name of a commit's remembered modules."""
     facts = json.dumps([_FORMAT, sys.version_info[:2], snapshot.commit, snapshot.path])
     return cache_root() / "imports", hashlib.sha256(facts.encode()).hexdigest()
 
@@ -233,9 +233,9 @@ def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
 
 @dataclass(frozen=True)
 class MissingModule:
-    """Advice for a repository whose import fails: in which sandbox it ran, ``where`` its packages
-    were to come from (see ``Choice``), the interpreter that the caller named, and whether it ran in
-    an environment of its own.
+    """Advice for a failed import: the sandbox (``place``), the source of packages (``where``, see
+    ``Choice``), the caller's interpreter, and whether the repository ran in an environment of its
+    own.
     """
 
     snapshot: Snapshot
@@ -245,8 +245,8 @@ class MissingModule:
     own: bool
 
     def advice(self, said: str = "") -> str:
-        """What the repository declares, where it imports the module that ``said`` names, and what
-        helps.
+        """Returns the declared packages, the place that imports the module in the error ``said``,
+        and what to do.
         """
         from envhub_sandbox.extras.packages.declared import declared
 
@@ -268,7 +268,7 @@ class MissingModule:
 
         names = of_module(module)
         path = _path_here(module.partition(".")[0], sys.path) if module else ""
-        if path and not names:  # an index may have another one of that name
+        if path and not names:  # an index may have another package of that name
             return self._local(module.partition(".")[0], path)
         if "." in module and (not names or module.partition(".")[0] in _WORKERS):
             return f"A package of another version has {module}"
@@ -287,7 +287,7 @@ class MissingModule:
         return f"{here}; it gets an environment of its own, and the package in it, with {extra}"
 
     def _local(self, module: str, path: str) -> str:
-        """What grants a module that this process can import, and the jail cannot."""
+        """Returns advice for a module that this process can import and the jail cannot."""
         here = f"{module} is importable here at {path}, which the jail cannot see"
         if self.place == "docker":
             image = option_name("sandbox", "docker:IMAGE")

@@ -1,9 +1,9 @@
-"""From a repository's files to the packages that it runs with: the same steps for every place.
+"""Makes the packages that a repository runs with, by the same steps for every place.
 
-read what it is to have (``request_of``), take the place's own packages if they meet it, choose
-versions (``resolution_for``), make an environment. What differs between this machine, a container
-and a server on another host is a ``PackageTarget``. With a lock file its packages are used and no
-others, and nothing that has drifted.
+The steps: read the request (``request_of``), use the place's own packages if they meet it, choose
+versions (``resolution_for``), make an environment. A ``PackageTarget`` holds the differences
+between this machine, a container and a server on another host. A lock file replaces the choice: its
+packages are used exactly, and drift is an error.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ class PackageSet:
     """Packages that were made for a repository.
 
     Attributes:
-        packages: Their folder, or their name in the place that has them.
-        facts: What is in it, as plain data.
-        python: The interpreter that they are for; empty where the place knows it.
-        environment: The folder's record, where it is on this machine.
+        packages: Their folder, or their name in their place.
+        facts: Their description as plain data.
+        python: The interpreter that they are for; empty if only the place knows it.
+        environment: The record of the folder, if it is on this machine.
     """
 
     packages: str
@@ -57,35 +57,35 @@ class PackageSet:
 
     @classmethod
     def of(cls, made: Environment) -> PackageSet:
-        """A folder of this machine."""
+        """Describes an environment of this machine."""
         return cls(str(made.packages), made.facts, made.python, made)
 
 
 class PackageTarget(Protocol):
-    """A place that a repository's packages are for."""
+    """A place that runs a repository: this machine, a container or a server."""
 
     def meets(self, request: PackageRequest) -> bool:
-        """Whether what is installed there is enough."""
+        """Tells whether the place's own packages meet the request."""
 
     def make(self, request: PackageRequest, tell: Tell) -> PackageSet | None:
-        """Packages of the repository's own; None where the place says that its own are enough."""
+        """Makes separate packages; None if the place decides that its own packages suffice."""
 
 
 @dataclass(frozen=True)
 class ThisMachine:
-    """The interpreters of this machine; with ``upgrade``, versions are chosen again."""
+    """This machine's interpreters; ``upgrade`` chooses versions again."""
 
     upgrade: bool = False
 
     def meets(self, request: PackageRequest) -> bool:
-        """Whether this process's interpreter has all of it."""
+        """Tells whether this process's interpreter meets the whole request."""
         from envhub_sandbox.extras.packages import interpreters, modules
 
         met = interpreters.first_unmet(request) is None
         return met and all(map(modules.is_here, request.guesses))
 
     def make(self, request: PackageRequest, tell: Tell) -> PackageSet:
-        """An environment; raises as ``resolution_for`` and ``environments.provide``."""
+        """Makes an environment; raises as ``resolution_for`` and ``environments.provide``."""
         from envhub_sandbox.extras.packages import environments
         from envhub_sandbox.extras.packages.resolution import resolutions
 
@@ -104,14 +104,14 @@ class ThisMachine:
 
 
 def _warn_of_cuda(lock: Lock, interpreter: Interpreter) -> None:
-    """Say what is to come, before it is downloaded, and what brings less."""
+    """Announce large downloads for CUDA before they begin, and the setting that avoids them."""
     from envhub_sandbox.extras.packages import environments
     from envhub_sandbox.extras.packages.locks import pylock
 
     if environments.ready(environments.key_of(lock, interpreter)) is not None:
         return
     size = 0
-    with contextlib.suppress(DependencyError, LockError):  # the installation will say what is wrong
+    with contextlib.suppress(DependencyError, LockError):  # the installation will report the fault
         packages = pylock.listed(lock.packages, interpreter.path, lock.options)
         size = sum(
             max((wheel.size or 0 for wheel in package.wheels), default=0) for package in packages
@@ -131,9 +131,9 @@ HERE = ThisMachine()
 def packages_for(
     snapshot: Snapshot, choice: Choice, target: PackageTarget = HERE, *, gpu: bool = False
 ) -> PackageSet | None:
-    """The packages that a repository runs with; None for those that the place has.
+    """Returns the packages that a repository runs with; None if it uses the place's own.
 
-    Progress is shown on a terminal. Raises ``DependencyError``, with what to change.
+    Shows progress on a terminal. Raises ``DependencyError``, with what to change.
     """
     from envhub_sandbox.extras.packages.locks.day import settled
 
@@ -148,7 +148,7 @@ def packages_for(
                 unavailable = error.reason in ("resolution", "index")
                 if request.wanted or request.always or not unavailable:
                     raise
-                # what it imports was read, and not said: it may do without
+                # imports are not declarations: the repository may run without these packages
                 DEPENDENCIES.warning("%s: nothing is installed for it: %s", snapshot.label, error)
                 return None
     except DependencyError as error:
@@ -159,7 +159,7 @@ def packages_for(
 
 
 def _is_unknown(repo_id: str, error: DependencyError) -> bool:
-    """Whether the index does not have the package that a reference names, or not that version."""
+    """Tells whether the index lacks the package, or the version, that a reference names."""
     name = re.escape(re.sub(r"[-_.]+", "-", re.split(r"[\[#@]", repo_id)[0]).lower())
     said = rf"no version of {name}\b|\b{name} was not found"
     return error.reason == "resolution" and re.search(said, str(error)) is not None
@@ -168,7 +168,7 @@ def _is_unknown(repo_id: str, error: DependencyError) -> bool:
 def opened_lock(
     path: str | os.PathLike[str], sandbox: object, python: object, dependencies: object
 ) -> LockFile:
-    """The lock of these arguments of ``make_env``; ``PolicyError`` if others say something else."""
+    """Reads the lock of ``make_env``; ``PolicyError`` if other arguments contradict it."""
     if python is not None or dependencies != "auto":
         raise PolicyError(
             f"{option_name('lock')} has the packages already; leave out {option_name('python')} "
@@ -185,9 +185,9 @@ def opened_lock(
 
 
 def locked_packages(snapshot: Snapshot, lock: LockFile) -> PackageSet:
-    """The environment of its packages; made if there is none.
+    """Returns the environment of a lock's packages; makes it if needed.
 
-    Raises ``LockDriftError`` where the files or the interpreter are others.
+    Raises ``LockDriftError`` if the files or the interpreter differ from the lock.
     """
     from envhub_sandbox.extras.packages import environments, interpreters
     from envhub_sandbox.extras.packages.locks import lockfile, making, pylock
@@ -211,8 +211,8 @@ def locked_packages(snapshot: Snapshot, lock: LockFile) -> PackageSet:
 def _with_wheels(
     lock: Lock, locked: Sequence[WheelOrigin], interpreter: Interpreter, tell: Tell
 ) -> Lock:
-    """The lock with wheels of what has none: kept, or built again of the locked sources.
-    Raises ``DependencyError`` where one cannot be built, or its source is another.
+    """Adds wheels for packages without one to a lock: kept wheels, or new builds of locked sources.
+    Raises ``DependencyError`` if a build fails or a source has changed.
     """
     from envhub_sandbox.extras.packages import environments
     from envhub_sandbox.extras.packages.builds.wheels import describe
@@ -236,9 +236,9 @@ def _with_wheels(
 def check_locked_tasks(
     manifest: Manifest, lock: LockFile, label: str, env_kwargs: Mapping[str, Any]
 ) -> None:
-    """Raise ``LockDriftError`` where a manifest's environments are not the locked ones.
+    """Raise ``LockDriftError`` if a manifest's environments differ from the locked ones.
 
-    With other arguments a repository may well make other environments.
+    Skips the comparison for other arguments, which may make other environments.
     """
     from envhub_sandbox.extras.packages.locks import lockfile, making
 

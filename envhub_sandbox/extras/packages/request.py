@@ -1,6 +1,6 @@
-"""What packages a repository is to have: what it declares, and the argument ``dependencies``.
+"""Decides which packages a repository needs, by its declarations and the ``dependencies`` argument.
 
-One value, whichever place the repository runs in. Reading it runs nothing.
+The result is the same for every place that runs the repository. Reading runs nothing.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import nearest, option_name
 from envhub_worker.protocol.records import dataclass
 
-if TYPE_CHECKING:  # they cost time, and most repositories need none of them
+if TYPE_CHECKING:  # slow to import, and most repositories need no packages
     from envhub_sandbox.extras.packages.declared import WantedPackage
     from envhub_sandbox.extras.packages.modules import Guess
 
 Tell = Callable[[str], None]
-"""Gets a line for people, for each thing that happens."""
+"""Receives one line of progress for people."""
 DATE = r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}:\d{2}(Z|[+-]\d{2}:\d{2}))?"
 AS_WRITTEN = "auto"
-"""Instead of a date: that of the repository."""
+"""Stands for the repository's own date."""
 _DECLARE = ("requirements.txt", "pyproject.toml")
 _SCRIPT, _LOOKED_AT = b"# /// script", 1024 * 1024  # as ``declared.py`` has them
 _ALIKE = 0.85
-"""From here on a name is a misspelt one: mujoco and mujoco-py are less alike."""
+"""Names at least this similar count as misspelt; mujoco and mujoco-py are less similar."""
 _NAMES = ("extra", "only", "without", "override", "python", "fetch_python", "exclude_newer")
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Where a repository's packages are to come from.
+    """The source of a repository's packages.
 
     Attributes:
-        where: ``"auto"``: its own environment, unless this interpreter has all of it; ``"host"``:
-            this interpreter; ``"own"``: its own environment.
-        python: A version or versions, or a path; empty for what the repository runs in.
-        exclude_newer: A date: packages of later are not seen; or ``"auto"`` for that of the
-            repository.
-        infer: Whether what it imports and does not declare is installed, too.
-        only: Requirements instead of those that it declares; None for those.
-        without: Names of packages that are left out, also where others need them.
-        override: Requirements that hold instead of all others of the same package.
+        where: ``"auto"``: its own environment, unless this interpreter meets everything;
+            ``"host"``: this interpreter; ``"own"``: its own environment.
+        python: A version or versions, or a path; empty for any that the repository supports.
+        exclude_newer: A date: later releases are ignored; or ``"auto"`` for the repository's own
+            date.
+        infer: Whether imported but undeclared packages are installed too.
+        only: Requirements in place of the declared ones; None keeps the declared ones.
+        without: Names of packages to leave out, even if other packages require them.
+        override: Requirements that replace all others for the same package.
         fetch_python: Whether uv may download an interpreter that this machine lacks.
     """
 
@@ -68,9 +68,9 @@ AUTO, HOST, DECLARED = Choice("auto"), Choice("host"), Choice("auto", infer=Fals
 def chosen(
     dependencies: str | os.PathLike[str] | Mapping[str, Any], python: str | Path | None
 ) -> tuple[Choice, str | Path | None]:
-    """The choice, and the interpreter whose packages are used, if it is one of the caller's.
+    """Returns the choice, and the caller's interpreter if its packages are used.
 
-    Both as ``make_env`` takes them; ``python`` wins over ``"auto"``.
+    Takes the arguments of ``make_env``; ``python`` wins over ``"auto"``.
     Raises ``PolicyError`` and ``DependencyError``.
     """
     if isinstance(dependencies, Mapping):
@@ -167,7 +167,7 @@ def _date(given: object) -> str | None:
     text = given if isinstance(given, str) else getattr(given, "isoformat", lambda: "")()
     try:
         is_date = re.fullmatch(DATE, text) and date.fromisoformat(text[:10])
-    except ValueError:  # of no calendar
+    except ValueError:  # no date of the calendar
         is_date = None
     if text != AS_WRITTEN and not is_date:
         raise PolicyError(
@@ -179,17 +179,17 @@ def _date(given: object) -> str | None:
 
 @dataclass(frozen=True)
 class PackageRequest:
-    """What packages a repository is to have; what ``Choice`` has, too, is the same here.
+    """The packages that a repository needs. Fields that ``Choice`` has too mean the same here.
 
     Attributes:
-        source: The file, or the argument, that says so.
-        supports: The versions of Python that the repository runs in; empty for any.
-        python: The version or versions that the caller asks for, or a path; empty for none.
-        always: Whether it gets an environment of its own even where the place meets all of it.
-        guesses: What it imports; what no other package brings is installed, too.
-        constraints: What holds for packages if something needs them.
-        gpu: Whether its jails are given one.
-        runs_worker: Whether the worker runs with them, so that they hold what it needs, too.
+        source: The file or the argument that names the packages.
+        supports: The versions of Python that the repository supports; empty for any.
+        python: The version, versions or path from the caller; empty for none.
+        always: Whether it gets its own environment even if the place meets everything.
+        guesses: Its imports; a guess is installed unless another package brings the module.
+        constraints: Limits for packages, if something requires these.
+        gpu: Whether its jails get a GPU.
+        runs_worker: Whether the worker runs with these packages, which then include its own needs.
     """
 
     source: str
@@ -208,7 +208,7 @@ class PackageRequest:
 
 
 def request_of(snapshot: Snapshot, choice: Choice, *, gpu: bool = False) -> PackageRequest | None:
-    """What a repository is to have; None where the place's own packages are used as they are."""
+    """Returns a repository's request; None if it uses the place's own packages unchanged."""
     if choice.where == "host":
         return None
     auto, found = choice.where == "auto", None

@@ -1,4 +1,4 @@
-"""The packages of a repository as ``make_env`` asks for them: see ``factory.package_source``."""
+"""Implements the packages of a repository for ``make_env``: see ``factory.package_source``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RepositoryPackages:
-    """Makes what a repository declares and imports, or what a lock has."""
+    """Makes the packages that a repository declares and imports, or those of a lock."""
 
     choice: Choice
     python: str | Path | None
@@ -42,44 +42,44 @@ class RepositoryPackages:
         python: str | Path | None,
         dependencies: str | os.PathLike[str] | Mapping[str, Any],
     ) -> RepositoryPackages:
-        """Of arguments of ``make_env``. Raises ``PolicyError``, ``LockError``."""
+        """Reads the arguments of ``make_env``. Raises ``PolicyError``, ``LockError``."""
         opened = None if lock is None else opened_lock(lock, sandbox, python, dependencies)
         return cls(*chosen(dependencies, python), opened)
 
     @property
     def assets(self) -> Sequence[str]:
-        """The further repositories that the lock names."""
+        """Returns the further repositories that the lock names."""
         return self.lock.assets if self.lock is not None else ()
 
     @property
     def always(self) -> bool:
-        """Whether the repository gets packages of its own, whatever the place has."""
+        """Tells whether the repository gets its own packages even if the place meets everything."""
         return self.choice.where == "own"
 
     def packages(
         self, snapshot: Snapshot, target: PackageTarget | None, *, gpu: bool
     ) -> PackageSet | None:
-        """Packages of its own, made for a place; None for those of the place."""
+        """Makes its own packages for a place; None if it uses the place's packages."""
         if self.lock is not None:
             return locked_packages(snapshot, self.lock)
         return None if target is None else packages_for(snapshot, self.choice, target, gpu=gpu)
 
     def advice(self, snapshot: Snapshot, place: str, own: bool, text: str) -> str:
-        """What to do where a module is missing, for the error's text."""
+        """Returns advice for a missing module, for the error's text."""
         return MissingModule(snapshot, place, self.choice.where, self.python, own).advice(text)
 
     def note(self, snapshot: Snapshot, target: PackageTarget | None, text: str) -> bool:
-        """Note a module that was missing; whether ``packages`` gives others now."""
+        """Note a missing module; tells whether ``packages`` now gives different packages."""
         return self.choice.infer and self._chooses(target) and note_missing(snapshot, text)
 
     def _chooses(self, target: PackageTarget | None) -> bool:
-        """Whether the versions of its packages are ours to choose."""
+        """Tells whether we choose the versions of its packages."""
         return self.lock is None and target is not None and self.choice.where != "host"
 
     def of_its_day(
         self, snapshot: Snapshot, target: PackageTarget | None, error: EnvHubError
     ) -> str:
-        """What to do about an error that older packages may cure; empty for others."""
+        """Returns advice for an error that older packages may cure; empty for other errors."""
         of_today = self._chooses(target) and self.choice.exclude_newer is None
         if not of_today:
             return ""
@@ -90,6 +90,6 @@ class RepositoryPackages:
     def check(
         self, manifest: Manifest, label: str, env_kwargs: Mapping[str, Any], config: object
     ) -> None:
-        """Raise ``LockDriftError`` where a manifest is not what was locked."""
+        """Raise ``LockDriftError`` if a manifest differs from the lock."""
         if self.lock is not None and config is None:
             check_locked_tasks(manifest, self.lock, label, env_kwargs)

@@ -1,4 +1,4 @@
-"""``envhub lock``: what a repository was, and with ``--check`` whether it still is."""
+"""``envhub lock``: records a repository's state, and with ``--check`` compares it."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def _verify(
 
         locked = lockfile.read(file)
         place = _reference(ref, locked, file)
-        if ref is None:  # the lock names it, which may be a stranger's
+        if ref is None:  # the reference is the lock's, which may be a stranger's
             make.snapshot(place, public=True)
         snapshot = make.snapshot_with_assets(place, locked.assets)
         now = _now(locked, snapshot, no_index=no_index)
@@ -147,7 +147,7 @@ def _verify(
 
 
 def _check_options(context: typer.Context, *, is_check: bool) -> None:
-    """Refuse options that would mean nothing. Raises ``UsageError``: there is one."""
+    """Raise ``UsageError`` for an option that would have no effect."""
     of_a_new_lock = {"output", "upgrade", "dependencies", "env_kwargs", "assets"}
     idle = of_a_new_lock if is_check else {"no_index"}
     for parameter in context.command.params:
@@ -171,7 +171,7 @@ def _path(output: Path | None, snapshot: Snapshot) -> Path:
     if output is None:
         name = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(snapshot.repo_id).name).strip("-") or "env"
         output = Path(f"pylock.{name}.toml")
-        if _is_inside(Path.cwd(), snapshot):  # a file in there would be one more to lock
+        if _is_inside(Path.cwd(), snapshot):  # a lock file inside would be locked itself
             output = Path(snapshot.repo_id).parent / output
     path = Path(os.path.abspath(output))
     if _is_inside(path.parent, snapshot):
@@ -214,7 +214,7 @@ def _choice(given: Any, old: LockFile | None) -> Choice:
 
 
 def _kwargs(given: dict[str, Any], old: LockFile | None) -> dict[str, Any]:
-    """Those of the old lock where none are given."""
+    """Returns the arguments of the old lock if the caller gives none."""
     if given or old is None or old.spaces is None:
         return given
     return opt.read_env_kwargs([old.spaces.arguments])
@@ -223,7 +223,7 @@ def _kwargs(given: dict[str, Any], old: LockFile | None) -> dict[str, Any]:
 def _with_spaces(
     made: LockFile, snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]
 ) -> LockFile:
-    """The lock with what its repository returns, in the sandbox and in its own environment."""
+    """Adds the spaces that the repository returns in the sandbox, with the packages of the lock."""
     from envhub_sandbox.extras.packages.locks import lockfile, making
     from envhub_sandbox.factory.make_env import make_env
 

@@ -1,1 +1,1 @@
-"""What a repository was when it was locked or written, and whether it still is."""
+"""Locks a repository's state, tells when it was written, and compares it with a lock."""

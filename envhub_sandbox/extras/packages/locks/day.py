@@ -1,6 +1,6 @@
-"""When a repository was written: packages of later may have broken it, and those of then cure it.
+"""Tells when a repository was written: later packages may break it, those of that day cure it.
 
-A date is somebody's word and no more: it decides which releases of packages a jail gets.
+Trust: a date is a stranger's word, and only decides which releases of packages a jail gets.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ _BROKEN_BY = {
         "2022-12-18",
     ),
 }
-"""By what is said then: what takes an earlier release, and the day from which on no date does."""
+"""By pattern of an error: a requirement for an earlier release, and the day of the break."""
 _RECENT = timedelta(days=30)
 _MOST_DATES, _MOST_TEXT = 4, 65_536
 
 
 def of_its_day(snapshot: Snapshot, error: EnvHubError) -> str:
-    """What to do about an error at a start that packages of the repository's day may cure; empty
-    for others, and for what is of today.
+    """Returns advice for an error at a start that packages of the repository's day may cure; empty
+    for other errors, and for a repository of today.
     """
     text, days = _said_at_start(error), days_for(snapshot, error)
     for pattern, (requirement, broken) in _BROKEN_BY.items():
         if re.search(pattern, text) and (not days or days[0] >= broken):
-            # not "override": the others are then chosen to fit an earlier one
+            # not "override": then the other packages are chosen to fit the earlier release
             older = option_name("dependencies", {"extra": [requirement]})
             return f"A later release of a package has broken it; {older} takes an earlier one"
     if not days:
@@ -68,7 +68,7 @@ def of_its_day(snapshot: Snapshot, error: EnvHubError) -> str:
 
 
 def settled(snapshot: Snapshot, choice: Choice) -> Choice:
-    """The choice with a date for ``"auto"``. Raises ``PolicyError``: it is not known."""
+    """Replaces ``"auto"`` in a choice by the date. Raises ``PolicyError``: the date is unknown."""
     if choice.exclude_newer != AS_WRITTEN:
         return choice
     if day := written(snapshot):
@@ -80,7 +80,7 @@ def settled(snapshot: Snapshot, choice: Choice) -> Choice:
 
 
 def written(snapshot: Snapshot) -> str:
-    """The day of its commit, its release or its newest file, ``"2024-05-31"``; empty if unknown."""
+    """Returns the day of the commit, release or newest file, ``"2024-05-31"``; empty if unknown."""
     day = ""
     with contextlib.suppress(EnvHubError, HubFailure, OSError, ValueError, LookupError):
         if snapshot.is_local:
@@ -94,8 +94,8 @@ def written(snapshot: Snapshot) -> str:
 
 
 def days_for(snapshot: Snapshot, error: EnvHubError) -> list[str]:
-    """The day on which it was written, and a few later ones, each nearer to today by half: those
-    whose packages may cure an error.
+    """Returns days whose packages may cure an error: the day on which the repository was written,
+    and a few later ones, each halving the distance to today.
     """
     day = written(snapshot) if _may_be_outdated(error) else ""
     now = datetime.now(timezone.utc)
@@ -108,7 +108,7 @@ def days_for(snapshot: Snapshot, error: EnvHubError) -> list[str]:
 
 
 def _may_be_outdated(error: EnvHubError) -> bool:
-    """Whether older packages may cure it: it says so, or a package raised it, and lacks no file."""
+    """Tells whether older packages may cure an error: its text or traceback points to a package."""
     said = _said_at_start(error)
     remote = _remote(error)
     if not said or remote is None or isinstance(remote, (OSError, EOFError, MemoryError)):
@@ -118,8 +118,8 @@ def _may_be_outdated(error: EnvHubError) -> bool:
 
 
 def _said_at_start(error: EnvHubError) -> str:
-    """What code raised as it was loaded or reset; empty for any other error.
-    Trust: text from the worker, by which one of our sentences is chosen.
+    """Returns the text of an error at loading or reset; empty for any other error.
+    Trust: text from the worker, which only selects one of our sentences.
     """
     remote = _remote(error)
     if remote is None:
@@ -158,6 +158,6 @@ def _of_commit(snapshot: Snapshot) -> str:
 
     if snapshot.repo_type == GIT:
         return git_commits.day_of(snapshot.repo_id, snapshot.commit)
-    # only where it is from: the name of a private repository is nobody else's
+    # only its own host is asked: a private repository's name must not leave it
     repo = Repository(snapshot.repo_type, snapshot.repo_id)
     return HubClient(store.endpoint_of(snapshot.root)).changed(repo, snapshot.commit)

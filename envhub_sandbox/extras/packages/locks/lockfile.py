@@ -1,7 +1,7 @@
-"""Lock files: ``pylock.<name>.toml``, with what is ours under ``[tool.envhub]``.
+"""Reads and writes lock files: ``pylock.<name>.toml``, with our part under ``[tool.envhub]``.
 
-The file is the caller's own, but may have come with somebody's project: it is read as data within
-bounds, and decides nothing but what it is about. See ``docs/dependencies.md``.
+Trust: the file is the caller's, but may come with a stranger's project. It is read as data within
+bounds, and decides only about packages and drift. See ``docs/dependencies.md``.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MAX_FILES = 20_000
 MAX_TASKS = 4096
 MAX_TEXT = 4096
 LOCAL = "local"
-"""The repository of a folder of this machine, whose path means nothing elsewhere."""
+"""The name for a folder of this machine, whose path means nothing elsewhere."""
 _REQUIREMENTS = ("extra", "only", "override", "without")
 _COMMIT = re.compile(r"[0-9a-f]{40}|(local|pypi)-[0-9a-f]+")
 _PYTHON = re.compile(r"3\.\d{1,3}")
@@ -52,21 +52,21 @@ class Runner:
 
     @classmethod
     def of(cls, interpreter: Interpreter) -> Runner:
-        """That of an interpreter which is here."""
+        """Describes an interpreter of this machine."""
         python = ".".join(interpreter.version.split(".")[:2])
         return cls(interpreter.implementation, python, interpreter.machine)
 
 
 @dataclass(frozen=True)
 class TaskFingerprint:
-    """One environment, in a form that can be compared later and elsewhere.
+    """One environment, in a form to compare later and elsewhere.
 
     Attributes:
         suite: Key of the outer mapping.
-        task: Key of the inner one.
-        mode: Its autoreset mode; empty if it states none.
-        observations: The space of one sub-environment's observations, to be read.
-        spaces: SHA-256 of both, with every bound.
+        task: Key of the inner mapping.
+        mode: Its autoreset mode; empty if its metadata names none.
+        observations: The observation space of one sub-environment, as text for people.
+        spaces: SHA-256 of both spaces, with every bound.
     """
 
     suite: str
@@ -78,13 +78,13 @@ class TaskFingerprint:
 
     @property
     def name(self) -> str:
-        """For texts."""
+        """Returns the name for texts."""
         return f"{self.suite}/{self.task}"
 
 
 @dataclass(frozen=True)
 class Spaces:
-    """What a repository's ``make_env`` returned for arguments (as ``arguments_text`` writes)."""
+    """The environments that ``make_env`` returned for arguments (written by ``arguments_text``)."""
 
     arguments: str
     tasks: tuple[TaskFingerprint, ...]
@@ -92,14 +92,14 @@ class Spaces:
 
 @dataclass(frozen=True)
 class LockFile:
-    """All that is locked; what ``Choice`` has, too, is the same here.
+    """The content of a lock file. Fields that ``Choice`` has too mean the same here.
 
     Attributes:
-        repository: As a reference begins, such as ``"org/repo"``; or ``LOCAL``.
-        commit: The full commit; of a folder its content's.
-        runner: What the packages are for.
-        spaces: What the environments looked like; None where nothing was run.
-        inferred: What was taken though nothing declares it, and where it is imported.
+        repository: The reference without revision, such as ``"org/repo"``; or ``LOCAL``.
+        commit: The full commit; for a folder the hash of its content.
+        runner: The interpreter that the packages are for.
+        spaces: The environments' spaces; None if the repository was not run.
+        inferred: Packages that are imported but not declared, and the place of the import.
         assets: Further repositories that it may read, each at its commit.
     """
 
@@ -120,12 +120,12 @@ class LockFile:
 
 
 def repository_of(snapshot: Snapshot) -> str:
-    """As a lock file names it."""
+    """Returns the name of a snapshot's repository in a lock file."""
     return LOCAL if snapshot.is_local else snapshot.name
 
 
 def reference_of(lock: LockFile) -> str | None:
-    """The pinned reference; None for a folder, whose place is not known."""
+    """Returns the pinned reference; None for a folder, whose path is unknown."""
     if lock.repository == LOCAL:
         return None
     if lock.commit.startswith("pypi-"):
@@ -134,7 +134,7 @@ def reference_of(lock: LockFile) -> str | None:
 
 
 def arguments_text(env_kwargs: Mapping[str, Any] | None) -> str | None:
-    """Arguments in a form that can be compared; None for what has none."""
+    """Returns arguments in a comparable form; None if JSON cannot express them."""
     try:
         text = json.dumps(dict(env_kwargs or {}), sort_keys=True, allow_nan=False)
     except (TypeError, ValueError):
@@ -143,7 +143,7 @@ def arguments_text(env_kwargs: Mapping[str, Any] | None) -> str | None:
 
 
 def read(path: str | os.PathLike[str]) -> LockFile:
-    """A lock file; ``LockError`` if it cannot be read, or is none of ours."""
+    """Reads a lock file; ``LockError`` if it is unreadable or not one of ours."""
     where = f"the lock {os.fspath(path)}"
     try:
         with open(path, "rb") as file:
@@ -250,7 +250,7 @@ class _Reader:
 
 
 def written(lock: LockFile) -> str:
-    """The file's text."""
+    """Returns the text of the file."""
     head = {
         "lock-version": "1.0",
         "created-by": "envhub-sandbox",
@@ -284,7 +284,7 @@ def _task(task: TaskFingerprint) -> dict[str, object]:
 
 
 def write(lock: LockFile, path: Path) -> None:
-    """Write a lock file; meanwhile others read the old one. Raises ``LockError``."""
+    """Replace a lock file atomically. Raises ``LockError``."""
     try:
         write_whole_file(path, written(lock).encode(), mode=0o666)
     except (OSError, UnicodeEncodeError) as error:

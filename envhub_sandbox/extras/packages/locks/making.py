@@ -1,4 +1,4 @@
-"""Makes lock files of what is there now, and says what differs from one: drift."""
+"""Makes lock files of the present state, and lists differences from a lock: drift."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _TEXT = 200
 
 
 def differences(then: LockFile, now: LockFile) -> list[str]:
-    """Whatever differs, a line each."""
+    """Lists all differences, a line each."""
     runner = f"Python: {then.runner} was locked, this is {now.runner}"
     spaces: Iterator[str] = iter(())
     if then.spaces and now.spaces and then.spaces.arguments == now.spaces.arguments:
@@ -50,7 +50,7 @@ def differences(then: LockFile, now: LockFile) -> list[str]:
 
 
 def refuse(found: Sequence[str], label: str) -> None:
-    """Raise ``LockDriftError`` if anything has drifted."""
+    """Raise ``LockDriftError`` if there are differences."""
     if not found:
         return
     lines = "\n".join(f"  {line}" for line in first_of(found, _SHOWN))
@@ -62,7 +62,7 @@ def refuse(found: Sequence[str], label: str) -> None:
 
 
 def with_files(lock: LockFile, snapshot: Snapshot) -> LockFile:
-    """The same with the files of a snapshot."""
+    """Returns the lock with the files of a snapshot."""
     return replace(
         lock,
         repository=repository_of(snapshot),
@@ -129,7 +129,7 @@ def _of_package(then: PylockPackage, now: PylockPackage) -> Iterator[str]:
 def drift_of_tasks(
     then: Sequence[TaskFingerprint], now: Sequence[TaskFingerprint]
 ) -> Iterator[str]:
-    """What differs in environments."""
+    """Yields the differences between environments."""
     before, after = ({task.name: task for task in tasks} for tasks in (then, now))
     for name in sorted({*before, *after}):
         old, new, shown = before.get(name), after.get(name), printable(name, 200)
@@ -152,9 +152,9 @@ def drift_of_tasks(
 
 
 def locked(snapshot: Snapshot, choice: Choice, *, upgrade: bool = False) -> LockFile:
-    """A lock of a repository with the packages of a choice; nothing of either runs."""
+    """Locks a repository with the packages of a choice; runs neither of them."""
     request = request_of(snapshot, replace(settled(snapshot, choice), where="own"))
-    assert request is not None  # which only another choice gives
+    assert request is not None  # only ``where="host"`` gives None
     resolution = resolution_for(request, upgrade=upgrade)
     empty = LockFile(
         *("", "", "", {}, Runner.of(resolution.interpreter)),
@@ -174,7 +174,7 @@ def locked(snapshot: Snapshot, choice: Choice, *, upgrade: bool = False) -> Lock
 
 
 def again(lock: LockFile) -> Choice:
-    """The choice that led to a lock."""
+    """Returns the choice that led to a lock."""
     return Choice(
         "own",
         _parsed(lock.extra),
@@ -192,7 +192,7 @@ def _parsed(texts: Sequence[str]) -> tuple[WantedPackage, ...]:
 
 
 def relisted(lock: LockFile) -> LockFile:
-    """The same with the files that the index has of its packages now."""
+    """Returns the lock with the files that the index has for its packages now."""
     built = [package for package in lock.packages if package.origin is not None]
     pins = [
         f"{package.name}=={package.version}" for package in lock.packages if package.origin is None
@@ -207,7 +207,7 @@ def relisted(lock: LockFile) -> LockFile:
 def with_spaces(
     lock: LockFile, env_kwargs: Mapping[str, Any], suites: Mapping[str, Mapping[Any, Any]]
 ) -> LockFile:
-    """The same with what a repository's ``make_env`` returned for these arguments."""
+    """Returns the lock with the spaces that ``make_env`` returned for these arguments."""
     arguments = lockfile.arguments_text(env_kwargs)
     if arguments is None:
         raise LockError("env_kwargs have values that a lock cannot record")
@@ -215,7 +215,7 @@ def with_spaces(
 
 
 def tasks_of(suites: Mapping[str, Mapping[Any, Any]]) -> tuple[TaskFingerprint, ...]:
-    """What a repository's ``make_env`` returned, in a form that can be compared."""
+    """Describes the environments that ``make_env`` returned, in a comparable form."""
     fingerprints = []
     for suite, tasks in suites.items():
         for task, env in tasks.items():
@@ -234,7 +234,7 @@ def fingerprint_of_task(
     observations: gym.Space[Any],
     actions: gym.Space[Any],
 ) -> TaskFingerprint:
-    """What is to be remembered of an environment. Trust: input from the worker, already checked."""
+    """Describes one environment for a lock. Trust: input from the worker, already checked."""
     spaces = fingerprint_of_spaces(observations, actions)
     texts = (" ".join(str(space).split()) for space in (observations, actions))
     seen, done = (printable(text, _TEXT).replace("\n", " ") for text in texts)
@@ -242,7 +242,7 @@ def fingerprint_of_task(
 
 
 def fingerprint_of_spaces(*spaces: gym.Space[Any]) -> str:
-    """A hash of spaces: of their kinds, shapes, dtypes and bounds, and of no generator's state."""
+    """Hashes the kinds, shapes, dtypes and bounds of spaces, without the state of generators."""
     digest = hashlib.sha256()
     for space in spaces:
         _add(digest, encode_space(space))
@@ -250,7 +250,7 @@ def fingerprint_of_spaces(*spaces: gym.Space[Any]) -> str:
 
 
 def _add(digest: Any, value: object) -> None:
-    """Each value with its kind and length before it, so that no two look alike."""
+    """Hash a value after its kind and length, so that different values never read alike."""
     if isinstance(value, dict):
         if value.get("kind") == "opaque":  # its text may hold an address
             value = {name: item for name, item in value.items() if name != "text"}

@@ -1,11 +1,11 @@
-"""The part of a lock file that is a standard, https://peps.python.org/pep-0751/, as data.
+"""Reads and writes the standard part of a lock file, https://peps.python.org/pep-0751/, as data.
 
-uv writes it for the pins, and what it wrote is read, checked and printed anew. Nothing of a lock
-file is ever handed to uv as it stands: only names, versions and hashes of these forms get through.
+uv writes this part for the pins; this module reads its output, checks it and prints it anew. uv
+never receives the text of a lock file, only names, versions and hashes that match our patterns.
 
-A package without a wheel on the index is held to its source, which is fetched and hashed again. The
-hash of the wheel that was built says whether the next build gives the same bytes; compilers of two
-machines do not.
+A package without a wheel on the index is locked by its source, which is fetched and hashed again.
+The hash of the built wheel tells whether the next build gives the same bytes; the compilers of two
+machines give different ones.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from envhub_sandbox.hub.logins import without_login
 MAX_CHARACTERS = 16 * 1024 * 1024
 MAX_PACKAGES = 2000
 MAX_WHEELS = 200
-"""Of one package: one for each platform and interpreter that it is built for."""
+"""Wheels of one package: one for each platform and interpreter."""
 _NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _VERSION = re.compile(r"[A-Za-z0-9.!+_-]{1,200}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -44,8 +44,8 @@ _DESCRIBE_S = 600.0
 
 @dataclass(frozen=True)
 class Wheel:
-    """One file of a package; where it was found is for the reader: the user's settings say where it
-    is taken from. Its size may not be known.
+    """A file of a package. ``url`` informs readers of the lock: the user's settings decide where
+    the file comes from. The size may be unknown.
     """
 
     sha256: str
@@ -55,32 +55,32 @@ class Wheel:
 
 @dataclass(frozen=True)
 class PylockPackage:
-    """A package at one version, with the files that it may be installed from."""
+    """A package at one version, with the files that may be installed for it."""
 
     name: str
     version: str
     wheels: tuple[Wheel, ...]
     origin: WheelOrigin | None = None
-    """What it is built of, where it has no wheels."""
+    """The origin of its wheel, if the index has no wheels."""
 
     @property
     def pin(self) -> str:
-        """As pip's ``--require-hashes`` reads it."""
+        """Returns the pin in the form of pip's ``--require-hashes``."""
         known = [self.origin.wheel] if self.origin else [wheel.sha256 for wheel in self.wheels]
         hashes = (f"    --hash=sha256:{digest}" for digest in known)
         return " \\\n".join([f"{self.name}=={self.version}", *hashes]) + "\n"
 
 
 def pins(packages: Sequence[PylockPackage]) -> Lock:
-    """What is installed for them."""
+    """Returns the lock that installs the packages."""
     lock = Lock("".join(package.pin for package in packages))
     return replace(lock, options=torch_options(lock))
 
 
 def described(lock: Lock, python: str) -> tuple[PylockPackage, ...]:
-    """The pins with their files, as the index has them now, for the interpreter at this path.
+    """Returns the pins with their files on the index, for the interpreter at this path.
 
-    Raises ``DependencyError`` where no file of a package is one that the pins permit.
+    Raises ``DependencyError`` if the pins permit no file of a package.
     """
     versions = [line.partition(" ")[0] for line in lock.text.splitlines()]
     available = listed(versions, python, lock.options)
@@ -108,7 +108,7 @@ def described(lock: Lock, python: str) -> tuple[PylockPackage, ...]:
 def listed(
     versions: Sequence[str], python: str, options: Sequence[str] = (), *, refresh: bool = False
 ) -> tuple[PylockPackage, ...]:
-    """What the index has of each ``name==version``. Raises as ``uv.run``."""
+    """Lists the index's files for each ``name==version``. Raises as ``uv.run``."""
     text = uv.run(
         [
             *("pip", "compile", "-", *uv.NO_BUILDS, "--no-deps", "--format", "pylock.toml"),
@@ -125,7 +125,7 @@ def listed(
 
 
 def document(text: str, where: str) -> dict[str, Any]:
-    """The TOML of a lock file; ``LockError`` if it is none, or too long."""
+    """Parses the TOML of a lock file; ``LockError`` if it is invalid or too long."""
     try:
         return toml.loads(text, MAX_CHARACTERS, generated=True)
     except ValueError as error:
@@ -133,7 +133,7 @@ def document(text: str, where: str) -> dict[str, Any]:
 
 
 def read(document: Mapping[str, Any], where: str) -> tuple[PylockPackage, ...]:
-    """The packages in a lock file, sorted by name. Raises ``LockError``."""
+    """Returns the packages in a lock file, sorted by name. Raises ``LockError``."""
     if document.get("lock-version") != "1.0":
         raise LockError(f"{where} is not a lock file of version 1.0")
     given = document.get("packages")
@@ -187,7 +187,7 @@ def _is(value: object, form: re.Pattern[str]) -> TypeGuard[str]:
 
 
 def _origin(given: Mapping[str, Any], name: str, version: str, where: str) -> WheelOrigin | None:
-    """What a package is built of; None for one that has wheels on an index."""
+    """Returns the origin of a package's wheel; None for a package with wheels on an index."""
     ours = table(given, "tool", "envhub")
     if not ours:
         return None
@@ -216,7 +216,7 @@ def _of_git(vcs: Mapping[str, Any], name: str, version: str, where: str) -> Sour
 
 
 def _origins(lock: Lock) -> dict[str, WheelOrigin]:
-    """What was built here of the packages of a lock, by the hash of the wheel."""
+    """Returns the origins of a lock's wheels that were built here, by the hash of the wheel."""
     folders = [Path(option) for option in lock.options if option.startswith("/")]
     wheels = [wheel for folder in folders for wheel in folder.glob("*.whl")]
     origins = [built for built in map(describe, wheels) if built is not None]
@@ -224,7 +224,7 @@ def _origins(lock: Lock) -> dict[str, WheelOrigin]:
 
 
 def written(packages: Sequence[PylockPackage]) -> str:
-    """The packages as the standard has them."""
+    """Returns the packages in the standard's form."""
     lines = []
     for package in packages:
         lines += ["", "[[packages]]", *rows({"name": package.name, "version": package.version})]
@@ -253,12 +253,12 @@ def _of_origin(origin: WheelOrigin) -> dict[str, object]:
 
 
 def rows(table: Mapping[str, object]) -> list[str]:
-    """The lines of a table of TOML."""
+    """Returns the lines of a TOML table."""
     return [f"{name} = {as_toml(value)}" for name, value in table.items()]
 
 
 def as_toml(value: object) -> str:
-    """A value in one line. A text of JSON is one of TOML, but for one control character."""
+    """Returns a value in one line. TOML accepts JSON strings except for one control character."""
     if isinstance(value, Mapping):
         return f"{{ {', '.join(rows(value))} }}"
     if isinstance(value, (list, tuple)):

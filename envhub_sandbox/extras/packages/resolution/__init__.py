@@ -1,1 +1,1 @@
-"""From requirements to wheels: the index, uv, what was resolved."""
+"""Resolves requirements to wheels: settings for the index, uv, and remembered resolutions."""

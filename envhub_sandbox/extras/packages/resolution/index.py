@@ -1,8 +1,8 @@
-"""Where packages come from: the user's own settings for uv, or else for pip.
+"""Decides where packages come from: by the user's settings for uv, or else for pip.
 
-uv gets an environment that is made here, name by name: what chooses an index, a proxy, a
-certificate or a cache is the user's to say, and nothing that would turn builds on gets through.
-Users behind a mirror have mostly configured pip; what is not configured for uv is taken from there.
+This module builds uv's environment name by name. The user's variables choose index, proxy,
+certificates and cache; no variable that permits builds gets through. Users behind a mirror usually
+configure pip; uv takes over what they have not configured for uv.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _YES = ("1", "true", "yes", "on")
 
 
 def environment(variables: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The environment that uv runs in, of the user's variables (those of this process)."""
+    """Builds uv's environment from the user's variables (default: this process's)."""
     given = os.environ if variables is None else variables
     kept = {name: value for name, value in given.items() if value and _KEPT.fullmatch(name)}
     if not any(name in kept for name in _CHOOSE_AN_INDEX):
@@ -50,7 +50,7 @@ def environment(variables: Mapping[str, str] | None = None) -> dict[str, str]:
 
 
 def _from_here(name: str, value: str) -> str:
-    """A path as the user means it: uv runs in another folder."""
+    """Makes a path absolute, since uv runs in another folder."""
     if name == "UV_FIND_LINKS":
         return ",".join(map(_absolute, value.split(",")))
     return _absolute(value) if name in _PATHS else value
@@ -61,39 +61,39 @@ def _absolute(place: str) -> str:
 
 
 def uv_cache() -> Path:
-    """Where uv keeps what it downloads and unpacks."""
+    """Returns the folder where uv keeps and unpacks downloads."""
     found = environment()
     home = found.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     return Path(found.get("UV_CACHE_DIR") or os.path.join(home, "uv"))
 
 
 def is_chosen() -> bool:
-    """Whether the user has named an index."""
+    """Tells whether the user has named an index."""
     found = environment()
     return any(name in found for name in _CHOOSE_AN_INDEX)
 
 
 def hides_refusals() -> bool:
-    """Whether uv takes an index that wants a login for one that does not have the package."""
+    """Tells whether uv treats an index that requires a login as one without the package."""
     return environment().get("UV_INDEX_STRATEGY", "").startswith("unsafe")
 
 
 def options() -> tuple[str, ...]:
-    """Options on the command line of uv: it has no variable for that there is no index."""
+    """Returns options for uv's command line: no variable of uv's turns the index off."""
     return ("--no-index",) if environment().get("UV_NO_INDEX", "").lower() in _YES else ()
 
 
 def places() -> list[str]:
-    """What of it decides where packages come from, as ``NAME=value``; it may hold passwords."""
+    """Returns the settings for the source of packages as ``NAME=value``; may include passwords."""
     found = environment()
     names = (*_CHOOSE_AN_INDEX, "UV_INDEX_STRATEGY", "UV_EXCLUDE_NEWER", "UV_TORCH_BACKEND")
     return [f"{name}={found[name]}" for name in names if name in found]
 
 
 def pip_settings(variables: Mapping[str, str]) -> dict[str, str]:
-    """pip's own settings by their long names; a variable wins over files, a later file over others.
+    """Returns pip's settings by long names; a variable wins over files, a later file over earlier.
 
-    Files that cannot be read are passed over, as they say nothing of ours.
+    Skips unreadable files.
     """
     found: dict[str, str] = {}
     for path in _pip_files(variables):
@@ -112,7 +112,7 @@ def pip_settings(variables: Mapping[str, str]) -> dict[str, str]:
 
 
 def _pip_files(variables: Mapping[str, str]) -> list[Path]:
-    """In pip's order: the machine's, the user's, the environment's, and the one that is named."""
+    """Lists files in pip's order: machine, user, environment, and the file in the variable."""
     named = variables.get("PIP_CONFIG_FILE", "")
     if named == os.devnull:
         return []
@@ -131,7 +131,7 @@ def _as_uv_says(pip: Mapping[str, str], kept: Mapping[str, str]) -> dict[str, st
         said["UV_DEFAULT_INDEX"] = index
     if more := pip.get("extra-index-url", "").split():
         said["UV_INDEX"] = " ".join(more)
-        # pip has no first index: it takes the best version of all of them
+        # pip has no first index: it takes the best version among all indexes
         said["UV_INDEX_STRATEGY"] = kept.get("UV_INDEX_STRATEGY", "unsafe-best-match")
     if links := pip.get("find-links", "").split():
         said["UV_FIND_LINKS"] = ",".join(links)

@@ -1,7 +1,7 @@
-"""Which versions a repository gets, and of which interpreter: chosen once, and remembered.
+"""Chooses versions and interpreter for a repository once, and remembers them.
 
-What is remembered goes by everything that the choice depends on: the same repository gets the same
-packages on this machine until newer ones are asked for, and needs no index a second time.
+The key covers everything that the choice depends on: the same repository gets the same packages on
+this machine until the caller requests newer ones, and needs no index a second time.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ if TYPE_CHECKING:
 _FORMAT = 2
 _MOST_CURES = 6
 Builder = Callable[[Sequence[Source], Interpreter, Tell], Sequence[Path]]
-"""Makes one wheel of each source, in the same order; each lies in a folder of wheels alone, and
-stays there. Raises ``DependencyError``."""
+"""Makes one wheel of each source, in the same order. Each wheel lies in a folder that holds only
+wheels, and stays there. Raises ``DependencyError``."""
 
 
 @dataclass(frozen=True)
 class Resolution:
-    """Versions and the interpreter that they are for; and the modules that are imported and not
-    declared, and were installed for it.
+    """Versions and their interpreter; ``taken``: the undeclared modules whose packages are
+    included.
     """
 
     lock: Lock
@@ -52,22 +52,22 @@ class Resolution:
 
 
 def build(sources: Sequence[Source], interpreter: Interpreter, tell: Tell) -> list[Path]:
-    """A wheel of each source, in the same order: kept from before, or built in a jail."""
+    """Returns a wheel of each source, in the same order: kept from before, or built in a jail."""
     from envhub_sandbox.extras.packages.builds.build import build_wheels
 
     return build_wheels(sources, interpreter, tell, partial(_lock_for, builder=BUILDER))
 
 
 BUILDER: Builder | None = build
-"""Makes wheels of packages that have none."""
+"""Makes wheels of packages without one; None permits no builds."""
 
 
 def resolution_for(
     request: PackageRequest, tell: Tell = lambda line: None, *, upgrade: bool = False
 ) -> Resolution:
-    """Versions for an interpreter of this machine: remembered, or chosen.
+    """Returns versions for an interpreter of this machine: remembered, or newly chosen.
 
-    Raises ``DependencyError``, with what to change: there are no versions, no interpreter, no
+    Raises ``DependencyError``, with what to change, if there are no versions, no interpreter, no
     index or no uv.
     """
     first = interpreters.find(request.python, request.supports, fetch=request.fetch_python)
@@ -90,7 +90,7 @@ def resolution_for(
 
 
 def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Tell) -> Resolution:
-    """By the first interpreter that has versions, of wheels alone if that can be."""
+    """Chooses the first interpreter that has versions, from wheels alone if possible."""
     tried: list[str] = []
     failed: list[DependencyError] = []
     for asked, builder in _attempts(request):
@@ -115,7 +115,7 @@ def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Te
 def _cure(
     request: PackageRequest, error: DependencyError, interpreter: Interpreter
 ) -> dict[str, list[str]] | None:
-    """Keys of ``dependencies`` with which a resolution succeeds; None if none is known."""
+    """Returns keys of ``dependencies`` with which a resolution succeeds; None if none is known."""
     for keys in islice(resolve.cures(error), _MOST_CURES):
         with contextlib.suppress(EnvHubError):
             changed = chosen(keys, None)[0]
@@ -131,7 +131,7 @@ def _cure(
 
 
 def _attempts(request: PackageRequest) -> Iterator[tuple[PackageRequest, Builder | None]]:
-    """What to ask for, and how: last of all without what is only guessed."""
+    """Yields requests and their builders; last the request without guesses."""
     every = (*request.wanted, *(guess.wanted for guess in request.guesses))
     wheels_alone = BUILDER is None or not any(one.requirement.url for one in every)
     ways = [*([None] if wheels_alone else []), *([BUILDER] if BUILDER else [])]
@@ -153,7 +153,7 @@ def _lock_for(
     builder: Builder | None,
     refresh: bool = False,
 ) -> Lock:
-    """Versions; each round builds what has no wheel and then looks at what that needs."""
+    """Resolves a request; each round builds packages without wheels and resolves their needs."""
     target = Target(python=interpreter.path)
     links: list[str] = []
     if builder is not None:
@@ -167,7 +167,7 @@ def _lock_for(
             names = sorted(set(resolve.without_wheels(error)) - built)
             if error.reason != "resolution" or builder is None or not names:
                 raise
-            # what one needs is known once it is built: then others may be chosen
+            # a package's needs are known once it is built, and may change the other versions
             sources = resolve.sources_of(request, target, names, links)
             if built.issuperset(one.name for one in sources):
                 raise
@@ -188,7 +188,7 @@ def _links(wheels: Sequence[Path]) -> list[str]:
 def _built_from_git(
     request: PackageRequest, builder: Builder, interpreter: Interpreter, tell: Tell
 ) -> tuple[PackageRequest, list[str]]:
-    """The request with versions of wheels instead of repositories, and where these wheels are."""
+    """Replaces git repositories in a request by built wheels; returns also the wheels' folders."""
     wanted, wheels = [], []
     for one in request.wanted:
         source = of_git(one.requirement, one.where) if one.requirement.url else None
@@ -206,8 +206,8 @@ def _built_from_git(
 def versions_for(
     request: PackageRequest, resolved: Callable[[PackageRequest], Lock]
 ) -> tuple[Lock, tuple[Guess, ...]]:
-    """Versions, and what was taken that nothing else brings; ``resolved`` gives them without
-    guesses.
+    """Returns versions, and the guesses that no other package covers; ``resolved`` resolves a
+    request without its guesses.
     """
     taken = request.guesses
     if request.wanted or not taken:
@@ -221,12 +221,12 @@ def versions_for(
 
 
 def root() -> Path:
-    """Where they lie; ours alone, since what lies there is installed."""
+    """Returns the folder of resolutions; private to this user, since we install what they list."""
     return folders.cache_root() / "resolutions"
 
 
 def key_of(request: PackageRequest, interpreter: Interpreter) -> str:
-    """The name of a resolution: the hash of what it depends on, the places of packages included."""
+    """Hashes everything that a resolution depends on, including the sources of packages."""
     asked = [
         sorted(map(str, rows)) for rows in (request.wanted, request.constraints, request.override)
     ]
@@ -237,12 +237,12 @@ def key_of(request: PackageRequest, interpreter: Interpreter) -> str:
 
 
 def recall(key: str) -> Resolution | None:
-    """What was chosen, if that is known, and its interpreter is still the same."""
+    """Returns the remembered resolution, if there is one and its interpreter is unchanged."""
     try:
         facts = json.loads(folders.recall(root(), key) or "{}")
         lock = Lock(str(facts["lock"]), tuple(map(str, facts["options"])))
         interpreter = Interpreter(**facts["interpreter"])
-        # what the worker needs is in each: an empty one was lost
+        # each lock includes the worker's needs: an empty one is damaged
         known = _stamp(interpreter) == facts["stamp"] and all(
             os.sep not in option or os.path.isdir(option) for option in lock.options
         )
@@ -254,7 +254,7 @@ def recall(key: str) -> Resolution | None:
 
 
 def remember(key: str, found: Resolution) -> None:
-    """Keep a choice. A cache that cannot be written is no error."""
+    """Remember a resolution. An unwritable cache is no error."""
     facts = {
         "lock": found.lock.text,
         "options": found.lock.options,
@@ -266,6 +266,6 @@ def remember(key: str, found: Resolution) -> None:
 
 
 def _stamp(interpreter: Interpreter) -> list[int]:
-    """Size and time of the interpreter's file, to notice an upgrade in place."""
+    """Returns size and time of the interpreter's file: these change with an upgrade in place."""
     status = os.stat(interpreter.path)
     return [status.st_size, status.st_mtime_ns]

@@ -1,4 +1,4 @@
-"""Requirements to pins: every package with the hashes of its wheels, for one interpreter."""
+"""Resolves requirements to pins: every package with the hashes of its wheels, per interpreter."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from envhub_sandbox.extras.sources import toml
 from envhub_sandbox.settings.options import option_name
 
 WORKERS = ("cloudpickle>=3", "gymnasium>=0.26", "msgpack>=1.0.5", "numpy>=1.21")
-"""What the worker's jails import besides: the repository's versions must be among these.
+"""The needs of the worker in a jail: the repository's versions must satisfy these.
 Gymnasium and numpy may be older in a jail than outside."""
 _WORKERS_SINCE = {
     "cloudpickle": "2023-11-01",
@@ -31,10 +31,10 @@ _WORKERS_SINCE = {
     "msgpack": "2023-11-01",
     "numpy": "2022-10-01",
 }
-"""From when on there are such versions, with wheels for Python 3.11: no earlier date counts."""
+"""The days of the first such versions with wheels for Python 3.11: no earlier date applies."""
 _RESOLVE_S = 600.0
 MOST_SOURCES = 50
-"""Packages that are built for one request: a repository names them, and each costs a resolution."""
+"""Packages that one request may build: a repository names them, and each costs a resolution."""
 _TORCH = ("torch", "torchvision", "torchaudio")
 _CPU_INDEX = ("--torch-backend", "cpu")
 _PIN = re.compile(r"([a-z0-9][a-z0-9.-]*)==([A-Za-z0-9.!+_-]+) \\")
@@ -53,8 +53,8 @@ _HASH = re.compile(r"    --hash=(sha(?:256|384|512):[0-9a-f]+)( \\)?")
 
 @dataclass(frozen=True)
 class Lock:
-    """Every package, pinned, with the hashes of its wheels, as pip's ``--require-hashes`` reads it;
-    and options for uv where the index does not have all of them.
+    """All packages, pinned with the hashes of their wheels in the form of pip's
+    ``--require-hashes``, and options for uv if the index lacks some of the packages.
     """
 
     text: str
@@ -62,7 +62,7 @@ class Lock:
 
     @property
     def has_cuda(self) -> bool:
-        """Whether PyTorch is among them, with packages of NVIDIA's."""
+        """Tells whether the packages include PyTorch and packages of NVIDIA's."""
         pins = self.packages
         return any(pin.startswith("torch==") for pin in pins) and any(
             pin.startswith(("nvidia-", "cuda-")) for pin in pins
@@ -70,24 +70,24 @@ class Lock:
 
     @property
     def digest(self) -> str:
-        """Hexadecimal SHA-256 of the text."""
+        """Returns the hexadecimal SHA-256 of the text."""
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     @property
     def packages(self) -> list[str]:
-        """``name==version`` of each."""
+        """Returns ``name==version`` of each package."""
         lines = [line.split()[0] for line in self.text.splitlines() if line[:1].isalnum()]
         return [line for line in lines if "==" in line]
 
 
 @dataclass(frozen=True)
 class Target:
-    """What packages are for: an interpreter that is here, or one that is described.
+    """The interpreter that packages are for: a local one, or a described one.
 
     Attributes:
-        python: Its path; empty where it is not on this machine.
-        version: Where it is not: its version, ``"3.12"``.
-        machine: Likewise, as ``os.uname`` says it; it has Linux with glibc.
+        python: The path of a local interpreter; empty for a described one.
+        version: The version of a described interpreter, ``"3.12"``.
+        machine: Its machine, as in ``os.uname``; the system is Linux with glibc.
     """
 
     python: str = ""
@@ -99,12 +99,12 @@ class Target:
 
     @property
     def options(self) -> tuple[str, ...]:
-        """For uv."""
+        """Returns the options for uv."""
         if self.python:
             return ("--python", self.python)
         platform = f"{self.machine}-manylinux_2_28"
-        # uv asks some interpreter all the same, and a .venv beside or above its working directory,
-        # which is one for temporary files, is the first that it would run: named, it runs ours
+        # uv queries some interpreter anyway. It would first run a .venv in or above its working
+        # directory, a temporary folder where others may write: this option makes it run ours.
         ours = ("--python", interpreters.own().path)
         return (*ours, "--python-version", self.version, "--python-platform", platform)
 
@@ -117,12 +117,11 @@ def resolve(
     refresh: bool = False,
     tell: Tell = lambda line: None,
 ) -> Lock:
-    """Pins for a target; wheels only, nothing is built.
+    """Returns pins for a target; accepts only wheels and builds nothing.
 
-    What the worker needs comes on top; guesses are not looked at. The installation needs the
-    ``options``, too. With ``refresh`` the index is asked anew for what uv has seen a moment ago.
-    Raises ``DependencyError``, also for a version that is there, but not with a hash that was
-    asked for (``reason`` is then ``"integrity"``).
+    Adds the worker's needs; ignores guesses. The installation needs the same ``options``.
+    ``refresh`` makes uv ask the index again in place of its cache. Raises ``DependencyError``, also
+    for a version whose files lack a required hash (``reason`` is then ``"integrity"``).
     """
     words = [*uv.NO_BUILDS, "--generate-hashes", *options, *(["--refresh"] if refresh else [])]
     text = _compiled(request, target, words, tell)
@@ -136,7 +135,7 @@ def _compiled(
     tell: Tell,
     settings: Mapping[str, str] = {},
 ) -> str:
-    """What ``uv pip compile`` prints; raises as ``resolve``."""
+    """Returns the output of ``uv pip compile``; raises as ``resolve``."""
     ours = WORKERS if request.runs_worker else ()
     where = "the worker of envhub-sandbox"
     every = [*request.wanted, *(parse_requirement(text, where) for text in ours)]
@@ -171,7 +170,7 @@ def _compiled(
 
 
 def _exclude_newer(request: PackageRequest) -> Iterator[str]:
-    """The date of a request, for uv, and later ones for what the worker cannot have older."""
+    """Yields uv's options for the date of a request; later dates for the worker's own needs."""
     if not request.exclude_newer:
         return
     yield f"--exclude-newer={request.exclude_newer}"
@@ -181,7 +180,7 @@ def _exclude_newer(request: PackageRequest) -> Iterator[str]:
 
 
 def _raise_refusal(ask: Callable[..., str]) -> None:
-    """Raise why an index did not answer: this strategy says so, and the others do not."""
+    """Raise an index's refusal: only this strategy of uv's reports it."""
     try:
         ask(variables={"UV_INDEX_STRATEGY": "first-index"})
     except DependencyError as error:
@@ -192,9 +191,9 @@ def _raise_refusal(ask: Callable[..., str]) -> None:
 def sources_of(
     request: PackageRequest, target: Target, names: Sequence[str], links: Sequence[str]
 ) -> list[Source]:
-    """The source distributions that are chosen for packages without wheels. Nothing is built.
+    """Returns source distributions that uv chooses for packages without wheels. Builds nothing.
 
-    What each needs is not known yet: it counts once there is a wheel of it.
+    Ignores the needs of each source: they are known once its wheel is built.
     """
     words = ["--config-file", "uv.toml", "--format", "pylock.toml", *links]
     known = sorted(names)
@@ -202,7 +201,7 @@ def sources_of(
         try:
             text = _compiled(request, target, words, lambda line: None, _may_be_built(known))
             break
-        except DependencyError as error:  # it names one at a time
+        except DependencyError as error:  # uv names one package at a time
             further = set(without_wheels(error)).difference(known)
             if error.reason != "resolution" or not further or len(known) >= MOST_SOURCES:
                 raise
@@ -216,7 +215,7 @@ def sources_of(
 
 
 def uploaded(wanted: WantedPackage, python: str) -> str:
-    """The day of the release that is chosen, as the index says it; empty if it does not."""
+    """Returns the day of the chosen release; empty if the index does not state it."""
     request, words = PackageRequest("", (wanted,), runs_worker=False), ("--format", "pylock.toml")
     ask = partial(_compiled, request, Target(python=python), tell=lambda line: None)
     try:
@@ -232,7 +231,7 @@ def uploaded(wanted: WantedPackage, python: str) -> str:
 
 
 def _may_be_built(names: Iterable[str]) -> dict[str, str]:
-    """uv's settings with which these are chosen as sources."""
+    """Returns uv's settings that permit it to choose these packages as sources."""
     tables = "".join(
         f'[[dependency-metadata]]\nname = "{name}"\nrequires-dist = []\n' for name in names
     )
@@ -253,17 +252,17 @@ def _lines(wanted: Iterable[WantedPackage]) -> str:
 
 
 def is_about_python(error: DependencyError) -> bool:
-    """Whether another Python may help, as far as uv's text says."""
+    """Tells whether uv's text suggests that another Python may help."""
     return _IS_PYTHON.search(str(error)) is not None
 
 
 def without_wheels(error: DependencyError) -> list[str]:
-    """Packages without a wheel, as far as uv's text says; none if it asks for another Python."""
+    """Returns packages without a wheel in uv's text; none if the text asks for another Python."""
     return [] if _NEEDS_PYTHON.search(str(error)) else _NO_WHEELS.findall(str(error))
 
 
 def _pins(text: str) -> list[tuple[str, str, list[str]]]:
-    """Name, version and hashes of each package; anything else in there is refused."""
+    """Parses name, version and hashes of each package; refuses any other line."""
     found: list[tuple[str, str, list[str]]] = []
     for line in text.splitlines():
         if pin := _PIN.fullmatch(line):
@@ -282,7 +281,7 @@ def _pins(text: str) -> list[tuple[str, str, list[str]]]:
 def _with_their_hashes(
     pins: Iterable[tuple[str, str, list[str]]], wanted: Sequence[WantedPackage]
 ) -> str:
-    """The lock's text, with only those hashes of a package that its requirement permits."""
+    """Returns the lock's text; each package keeps only the hashes that its requirement permits."""
     permitted: dict[str, tuple[set[str], str]] = {}
     for asked in wanted:
         if asked.hashes:
@@ -303,7 +302,7 @@ def _with_their_hashes(
 
 
 def _what_is_required(said: str, every: Sequence[WantedPackage]) -> str:
-    """The requirements that an explanation speaks of, with where each stands."""
+    """Lists the requirements that uv's explanation names, with the position of each."""
     words = {canonicalize_name(word) for word in re.findall(r"[A-Za-z0-9][A-Za-z0-9._-]*", said)}
     named = [one for one in every if canonicalize_name(one.requirement.name) in words]
     lines = [
@@ -314,14 +313,14 @@ def _what_is_required(said: str, every: Sequence[WantedPackage]) -> str:
 
 
 def _from_a_folder(name: str) -> str:
-    """That this interpreter has a package from a folder, which an index need not know."""
+    """Returns a note if this interpreter's package comes from a folder: the index may lack it."""
     folder = interpreters.installed_from(name)
     host = option_name("dependencies", "host")
     return f"; installed here from {folder}, which {host} uses" if folder else ""
 
 
 def cures(error: DependencyError) -> Iterator[dict[str, list[str]]]:
-    """Keys of ``dependencies`` that may help against what uv says, by the packages it speaks of."""
+    """Yields keys of ``dependencies`` that may help, for the packages in uv's text."""
     said = str(error).partition(REQUIRED)[0]
     unknown = re.findall(rf"([A-Za-z0-9][A-Za-z0-9._-]*) was {_NOT_FOUND}", said)
     unbuilt = re.match(r"([A-Za-z0-9][\w.-]*) \S+(?: \(.{0,300}?\))? has no wheel for", said)
@@ -338,9 +337,9 @@ def cures(error: DependencyError) -> Iterator[dict[str, list[str]]]:
 def advice(
     asked: str, tried: Sequence[str], error: DependencyError, cure: Mapping[str, list[str]] | None
 ) -> str:
-    """What to do where nothing satisfies all requirements, by the Python that was asked for, the
-    versions that were tried, the error of the first of them, and keys of ``dependencies`` that are
-    known to help.
+    """Returns advice if nothing satisfies all requirements. ``asked``: the requested Python;
+    ``tried``: the versions that were tried; ``error``: that of the first; ``cure``: keys of
+    ``dependencies`` that help.
     """
     others = ""
     needed = _NEEDS_PYTHON.findall(str(error))
@@ -361,10 +360,10 @@ def advice(
 def without_cuda(
     request: PackageRequest, lock: Lock, resolved: Callable[[PackageRequest, Sequence[str]], Lock]
 ) -> Lock:
-    """The same without CUDA, where jails have no GPU and the index has such builds of PyTorch.
+    """Returns the lock without CUDA, if jails have no GPU and the index has such builds of PyTorch.
 
-    Which builds there are, only the index knows, and many mirrors have none of these: that is no
-    error, and the versions that were chosen first stay. ``resolved`` takes further options for uv.
+    Only the index knows its builds, and many mirrors have none without CUDA: then the first choice
+    of versions stays. ``resolved`` takes further options for uv.
     """
     if request.gpu or not lock.has_cuda or os.environ.get("UV_TORCH_BACKEND"):
         return lock
@@ -381,7 +380,7 @@ def without_cuda(
 def _ways_without_cuda(
     request: PackageRequest, lock: Lock
 ) -> Iterator[tuple[PackageRequest, Sequence[str]]]:
-    """The same versions of the user's own index; and of PyTorch's, where he has chosen none."""
+    """Yields the same versions from the user's own index, or else also from PyTorch's."""
     rows = (pin.partition("==") for pin in lock.packages)
     held = tuple(
         parse_requirement(f"{name}=={version.partition('+')[0]}+cpu", "the choice of no CUDA")
@@ -394,7 +393,7 @@ def _ways_without_cuda(
 
 
 def torch_options(lock: Lock) -> tuple[str, ...]:
-    """What uv needs to find these versions again, where only they are known."""
+    """Returns the options with which uv finds these versions again, from the pins alone."""
     without = any(
         pin.partition("==")[0] in _TORCH and pin.endswith("+cpu") for pin in lock.packages
     )

@@ -1,7 +1,7 @@
-"""uv: found, started in an empty folder, and its refusals as errors of ours.
+"""Finds uv, runs it in an empty folder, and turns its refusals into our errors.
 
-It builds nothing, reads no settings but ours (``index.py``), and downloads no interpreter. What it
-prints is the user's to read, but quotes a stranger's names: it is escaped.
+uv builds nothing, reads only our settings (``index.py``), and downloads no interpreter. Its output
+is for the user, but quotes a stranger's names: this module escapes it.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ if sys.platform == "linux":
 
 NO_BUILDS = ("--no-config", "--no-build")
 OLDEST = (0, 11, 16)
-"""Before, a wheel's scripts went wherever the wheel said, and what is editable was built in spite
-of ``--no-build``. pyproject.toml asks for the same; but there may be another on PATH."""
+"""Older releases install a wheel's scripts wherever the wheel says, and build editable packages in
+spite of ``--no-build``. pyproject.toml requires this release too, but PATH may have another uv."""
 _VERSION_S = 60.0
 _SECRET = re.compile(r"(?<=://)[^/?#\s]*(?=@)|(?<=\?)[^\s?=]+=[^\s'\"`)]+")
-"""What may be one in a URL; uv hides passwords, but for those in a query or in what is no URL."""
+"""Possible secrets in a URL; uv hides passwords except in queries and in malformed URLs."""
 _WATCH_S = 1.0
 _CLEAN_S = 60.0
 CACHE_WAIT_S = 10.0
-"""For how long to wait for others who use uv's cache."""
+"""How long to wait for other users of uv's cache."""
 LISTEN_S = 10.0
-"""How long to read stderr after uv has ended: another process may hold it open for ever."""
+"""How long to read stderr after uv has ended: another process may keep it open for ever."""
 _SHOWN = 4000
 _KEPT_LINES = 400
 
@@ -60,7 +60,7 @@ _NO_LOGIN = (
     "HTTPS_PROXY"
 )
 
-# What uv says, and what that means for the user; the first that is found counts.
+# uv's messages and their meaning for the user; the first match counts.
 _MEANINGS: tuple[tuple[str, DependencyReason, str], ...] = (
     (
         r"No space left|os error 28|Disk quota|os error 122",
@@ -106,16 +106,16 @@ def run(
     files: Mapping[str, str] = {},
     variables: Mapping[str, str] = {},
 ) -> str:
-    """Run uv to its end, and return what it printed.
+    """Runs uv to its end; returns its output.
 
     Args:
-        keep: Descriptors that it keeps open for as long as it lives.
-        watch: Called now and then; what it raises ends it.
-        file_bytes: The largest file that it may write.
-        files: Texts that it finds in its folder, by name.
-        variables: Of its environment, instead of ours.
+        keep: Descriptors that uv keeps open until it ends.
+        watch: Called repeatedly; an exception from it ends uv.
+        file_bytes: The largest file that uv may write.
+        files: Texts for files in uv's folder, by name.
+        variables: Environment variables of uv's that override ours.
 
-    Raises ``DependencyError``: it failed, or there is none.
+    Raises ``DependencyError``: uv fails or is missing.
     """
     lines, done = list[str](), threading.Event()
     with (
@@ -123,7 +123,7 @@ def run(
         tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as asked,
         tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as printed,
     ):
-        # uv reads projects and settings of the folder that it runs in
+        # uv reads projects and settings in its working directory
         for name, text in files.items():
             Path(nowhere, name).write_text(text, "utf-8")
         asked.write(given)
@@ -140,7 +140,7 @@ def run(
             errors="replace",
         )
         heard = (process.stderr, lines, tell, done)
-        # not in a group of its own, which would outlive a server that is killed with its group
+        # uv stays in our process group: a signal that kills a server's group must reach uv
         listener = threading.Thread(target=_listen, args=heard, daemon=True)
         with process:
             try:
@@ -168,11 +168,11 @@ def run(
 
 
 def _limit_files(process: subprocess.Popen[str], largest: int) -> None:
-    if process.poll() is None and sys.platform == "linux":  # elsewhere ``watch`` measures alone
+    if process.poll() is None and sys.platform == "linux":  # elsewhere only ``watch`` limits sizes
         hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)[1]
         limit = largest if hard == resource.RLIM_INFINITY else min(largest, hard)
         resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (limit, limit))
-        # no core of it either: the signal would leave one
+        # no core dump: the signal would write one
         resource.prlimit(process.pid, resource.RLIMIT_CORE, (0, 0))
 
 
@@ -189,7 +189,7 @@ def _wait(process: subprocess.Popen[str], timeout_s: float, watch: Callable[[], 
 
 
 def _listen(stream: IO[str], lines: list[str], tell: Tell, done: threading.Event) -> None:
-    """Pass on what is written on stderr until ``done``, and keep the last lines of it."""
+    """Pass on the lines of stderr until ``done``, and keep the last ones."""
     for line in stream:
         if done.is_set():
             return
@@ -199,10 +199,10 @@ def _listen(stream: IO[str], lines: list[str], tell: Tell, done: threading.Event
 
 
 def command() -> str:
-    """uv's path; ``DependencyError`` if it is not installed, or too old."""
+    """Returns uv's path; ``DependencyError`` if uv is missing or too old."""
     found: str | None
     try:
-        from uv import find_uv_bin  # it knows where pip has put it, which need not be on PATH
+        from uv import find_uv_bin  # it knows pip's folder for uv, which may not be on PATH
 
         found = str(find_uv_bin())
     except (ImportError, FileNotFoundError):
@@ -246,7 +246,7 @@ def _error(what: str, said: str) -> DependencyError:
 
 
 def _in_the_users_words(said: str) -> str:
-    """uv speaks to the author of the requirements; the reader here is another person."""
+    """Rewords uv's text: uv addresses the author of the requirements, but the user reads it."""
     plain = re.sub(r"\byour requirements are unsatisfiable", "nothing satisfies all of them", said)
     plain = re.sub(r"\b[Yy]ou require\b", "it is required that there be", plain)
     return re.sub(r"^hint: ", "  ", plain, flags=re.MULTILINE).strip()
@@ -254,18 +254,18 @@ def _in_the_users_words(said: str) -> str:
 
 @contextlib.contextmanager
 def cleared_after_refusal(pins: Sequence[str]) -> Iterator[None]:
-    """Remove what uv has of these packages if they are refused; they can be downloaded again.
+    """Remove refused packages from uv's cache; uv can download them again.
 
-    uv unpacks a download in its cache before it installs it, and keeps what it had unpacked when
-    it was ended: a wheel that is too large would stay, and be found there the next time.
+    uv unpacks a download in its cache before it installs it, and keeps the files when it is ended:
+    otherwise a wheel that is too large would be found there the next time.
     """
     begun = time.time()
     try:
         yield
     except DependencyError as error:
         if error.reason == "index":
-            raise  # what has come is worth keeping
-        # from the file system's clock, which may be some milliseconds behind
+            raise  # these downloads are worth keeping
+        # a second earlier: the file system's clock may be some milliseconds behind
         if _remove_unfinished(index.uv_cache(), begun - 1):
             names = sorted({pin.partition("==")[0] for pin in pins})
             with contextlib.suppress(DependencyError):
@@ -278,10 +278,10 @@ def cleared_after_refusal(pins: Sequence[str]) -> Iterator[None]:
 
 
 def _remove_unfinished(cache: Path, since: float) -> bool:
-    """Remove uv's temporary folders of this time, once no uv is at work that could own one.
+    """Remove uv's temporary folders of this time, if no running uv could own one.
 
-    Each holds this lock, shared, for as long as it works; where one works on, nothing is removed,
-    and False returned.
+    Each running uv holds this shared lock. If one is still running, removes nothing and returns
+    False.
     """
     with contextlib.suppress(OSError), locks.held(cache / ".lock", wait_s=CACHE_WAIT_S):
         for path in cache.glob(".tmp*"):
