@@ -1,1 +1,1 @@
-"""Many places for the workers of one environment: which there are, and which worker goes where."""
+"""Several places for the workers of one environment, and the choice of a place for each worker."""

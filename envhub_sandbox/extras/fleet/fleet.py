@@ -17,8 +17,8 @@ MOST_PLACES = 4096
 
 
 def places_of(source: str | Sequence[str | Sandbox]) -> list[str | Sandbox]:
-    """The places that are named: a list, or text with commas between them.
-    Raises ``PolicyError``: there are none, or too many.
+    """Read the places from a list, or from a text with commas between them.
+    Raises ``PolicyError``: there are no places, or too many.
     """
     if isinstance(source, str):
         source = [word for word in map(str.strip, source.split(",")) if word]
@@ -35,14 +35,14 @@ def places_of(source: str | Sequence[str | Sandbox]) -> list[str | Sandbox]:
 class Fleet(Sandbox):
     """Several places for the workers of one environment.
 
-    Results, seeds and their order are those of a single place, whatever the places and the number
-    of workers. See ``docs/scaling.md``.
+    Results, seeds and their order equal those of a single place; they do not depend on the places
+    or the number of workers. See ``docs/scaling.md``.
 
     Attributes:
-        places: A list of values that ``sandbox`` takes for one place; a place that is listed twice
-            gets twice as many workers. Or text, with commas between the places. An address may be
-            followed by its server's public key: ``"tcp://HOST:PORT KEY"``.
-        remote: Further arguments of ``RemoteSandbox`` for all places that are addresses.
+        places: A list of values that ``sandbox`` takes for one place, or a text with commas between
+            the places. A place that is listed twice gets twice as many workers. The server's public
+            key may follow an address: ``"tcp://HOST:PORT KEY"``.
+        remote: Further arguments of ``RemoteSandbox`` for every place that is an address.
     """
 
     places: str | Sequence[str | Sandbox]
@@ -62,7 +62,7 @@ class Fleet(Sandbox):
             )
 
     def __getstate__(self) -> dict[str, Any]:
-        """No secret key is in a pickle: see ``RemoteSandbox``."""
+        """Leave a secret key out of the pickle: see ``RemoteSandbox``."""
         probe = RemoteSandbox("tcp://host:1", client_key=self.remote.get("client_key"))
         key = probe.__getstate__()["client_key"]
         return {**self.__dict__, "remote": {**self.remote, "client_key": key}}
@@ -74,8 +74,8 @@ class Fleet(Sandbox):
         return replace(self)
 
     def opened(self, resolve: Resolve) -> OpenFleet:
-        """The fleet of one ``make_env``.
-        ``resolve``: makes a sandbox of a name that is no address.
+        """Make the fleet of one ``make_env``.
+        ``resolve``: makes the sandbox of a place that is not a ``tcp://`` address.
         """
 
         def sandbox_of(sandbox: str | Sandbox) -> Sandbox:
@@ -89,14 +89,14 @@ class Fleet(Sandbox):
 
 
 def is_fleet(sandbox: object) -> bool:
-    """Whether this names several places."""
+    """Whether a value of ``sandbox`` names a fleet."""
     return isinstance(sandbox, (list, tuple, Fleet)) or (
         isinstance(sandbox, str) and is_list(sandbox)
     )
 
 
 class OpenFleet(Sandbox):
-    """The fleet of one ``make_env``: its places, and what was made there for the repository."""
+    """The fleet of one ``make_env``: its places, and the packages that they made for it."""
 
     name = "fleet"
 
@@ -111,9 +111,9 @@ class OpenFleet(Sandbox):
         self._packages.host = runtime
 
     def workers(self, num_workers: int | None) -> list[Seat]:
-        """A place for each worker: by default one worker on each."""
+        """See ``Sandbox``: a seat for each worker; by default one worker for each listed place."""
         return self._placement.seats(num_workers)
 
     def package_target(self) -> FleetPackages:
-        """See ``Sandbox``: each place has its own."""
+        """See ``Sandbox``: makes the packages on every place."""
         return self._packages

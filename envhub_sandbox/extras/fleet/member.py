@@ -1,4 +1,4 @@
-"""One place of a fleet, as it is for one repository, and the repository's packages on each."""
+"""A place of a fleet, prepared for one repository, and the repository's packages on all places."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 ForRepository = Callable[[Sandbox, Runtime], Sandbox]
-"""Makes of a place, and of what its jails run on, the place of one repository."""
+"""Makes the sandbox of one repository from a place's sandbox and the runtime of its jails."""
 
 
 class Member(Sandbox):
     """A place of a fleet.
 
-    Its packages may be others than those of the other places: each has an interpreter of its own.
+    Its packages may differ from those of other places, because each has its own interpreter.
 
     Args:
-        sandbox: The place as it was named.
-        runtime: Makes what its jails run on, once, and is called before anything else.
+        sandbox: The place's sandbox, before ``open_for``.
+        runtime: Makes the runtime of the place's jails; ``open_for`` calls it first, once.
 
     Attributes:
-        sandbox: Likewise.
-        weight: How often it is in the list.
-        absent: Whether it did not answer when packages were to be made there, or had no room.
+        sandbox: The place's sandbox, before ``open_for``.
+        weight: How often the caller's list has this place.
+        absent: Whether the place could not make packages because it had no room or no answer came.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Member(Sandbox):
 
     @property
     def is_open(self) -> bool:
-        """Whether ``open_for`` has made its place."""
+        """Whether ``open_for`` has prepared the place for the repository."""
         return self._opened is not None
 
     @property
@@ -63,14 +63,14 @@ class Member(Sandbox):
         return (self._opened[0] if self._opened else self.sandbox).address or self.name
 
     def open_for(self, repository: ForRepository) -> None:
-        """Make the place of one repository, once; raises as ``Sandbox.for_repository`` does."""
+        """Prepare the place for the repository, once; raises as ``Sandbox.for_repository``."""
         with self._opening:
             if self._opened is None:
                 self._runtime = self._runtime or self._make_runtime(self)
                 self._opened = repository(self.sandbox, self._runtime), self._runtime
 
     def runs_on(self, runtime: Runtime) -> Runtime:
-        """See ``Sandbox``; ``runtime`` is its own."""
+        """See ``Sandbox``; uses this place's own runtime instead of ``runtime``."""
         assert self._opened is not None
         place, own = self._opened
         return place.runs_on(own)
@@ -78,7 +78,7 @@ class Member(Sandbox):
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
     ) -> ServerUse[WorkerServer]:
-        """See ``Sandbox``; ``runtime`` is its own."""
+        """See ``Sandbox``; uses this place's own runtime instead of ``runtime``."""
         assert self._opened is not None
         place, own = self._opened
         return place.acquire(store, own, idle_s)
@@ -86,7 +86,7 @@ class Member(Sandbox):
     def prepare(
         self, order: m.OpenJail, server: WorkerServer, client: WorkerConnection, deadline: Deadline
     ) -> m.OpenJail:
-        """See ``Sandbox``; with the interpreter and the packages of this place."""
+        """See ``Sandbox``; the order gets the interpreter and the packages of this place."""
         assert self._opened is not None
         place, (python, packages) = self._opened
         order = m.replace(order, python=python, packages=packages)
@@ -97,8 +97,8 @@ class FleetPackages:
     """The packages of one repository on all places: a ``PackageTarget``. Thread-safe.
 
     Attributes:
-        members: The places that there are now.
-        host: What runs the repository where no packages are made: an interpreter of this machine.
+        members: Returns the places of the fleet.
+        host: The runtime on this machine if no packages are made: an interpreter of this machine.
     """
 
     def __init__(self) -> None:
@@ -109,15 +109,15 @@ class FleetPackages:
         self._made: dict[Member, PackageSet | None] = {}
 
     def meets(self, request: PackageRequest) -> bool:
-        """Whether what is installed there is enough, on every place."""
+        """Whether every place has the packages installed."""
         targets = [member.sandbox.package_target() for member in self.members()]
         return all(target is not None and target.meets(request) for target in targets)
 
     def make(self, request: PackageRequest, tell: Tell) -> PackageSet | None:
-        """Have every place make them, at the same time.
+        """Have all places make the packages, at the same time.
 
         A place that cannot be reached now makes them when a worker is placed there.
-        Raises ``DependencyError``: one of them cannot make any; the text says which.
+        Raises ``DependencyError``: a place cannot make the packages.
         """
         self._request = request
         members = self.members()
@@ -132,7 +132,7 @@ class FleetPackages:
         return self._summary()
 
     def _summary(self) -> PackageSet | None:
-        """What is said of them: the folder of this machine, if there is one, and all facts."""
+        """Combine the sets of all places: the folder on this machine, if any, and all facts."""
         sets = {member.address: made for member, made in self._made.items() if made is not None}
         if not sets:
             return None
@@ -162,7 +162,7 @@ class FleetPackages:
             self._made[member] = made
 
     def runtime_of(self, member: Member) -> Runtime:
-        """What a place's jails run on; packages are made there first, if it has not made them."""
+        """Return the runtime of a place's jails; have the place make its packages before."""
         if self._request is not None and member not in self._made:
             self._make(member, self._request, lambda line: None)
         made = self._made.get(member)

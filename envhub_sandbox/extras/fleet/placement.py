@@ -1,9 +1,9 @@
-"""Which worker of a fleet goes where.
+"""Chooses a place of a fleet for each worker.
 
-A worker goes where the fewest workers of its fleet are, among the places that answer and have room;
-of several such, where there is most room by the word of its server, and then by the order of the
-list. It comes back where it was, if that place answers. A place that refuses it, or does not
-answer, is followed by the next: all are tried before a worker has none. Results never depend on it.
+Only places that answer and have room are chosen, as long as there are any. Among these a worker
+returns to its previous place; a new worker goes to the place with the fewest workers for its
+weight, then to the one whose server reports most room, then to the first in the list. If a place
+refuses the worker, the next one is tried, until all have been tried. Results never depend on it.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from envhub_sandbox.transport.replies import UnreachableError
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 _WAIT_S = 1.5
-"""How long servers may take to answer: one that takes longer comes after those that have."""
+"""Seconds to wait for servers' answers; a server without one ranks after those that answered."""
 _FRESH_S = 2.0
-"""For how long an answer holds, less what has been placed there since."""
+"""Seconds for which an answer is used, less the workers that have been placed there since."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class Room:
     """The room of one place.
 
     Attributes:
-        answers: Whether it has answered; true of a place that is not asked.
-        known_s: When it was asked.
-        workers: For how many more workers there is room; infinity where nothing bounds them.
+        answers: Whether the place has answered; true for a place that is no remote server.
+        workers: The number of further workers that fit; infinity for a place that is not asked.
+        known_s: The time at which the place was asked.
     """
 
     answers: bool = True
@@ -52,8 +52,8 @@ class Room:
 
 
 class Rooms:
-    """The rooms of a fleet's places. Thread-safe.
-    ``memory_bytes``: what a worker takes of its key's quota.
+    """Asks a fleet's servers for their room. Thread-safe.
+    ``memory_bytes``: a worker's share of its key's quota of memory.
     """
 
     def __init__(self, memory_bytes: int) -> None:
@@ -62,12 +62,12 @@ class Rooms:
         self._pending: dict[Member, tuple[float, Call[ServerFacts]]] = {}
 
     def ask(self, members: Iterable[Member]) -> dict[Member, Room]:
-        """The room of each, asked of all at the same time; of one that is not a server its own."""
+        """Ask all remote servers among the places for their room, at the same time."""
         sandboxes = {member: member.sandbox for member in members}
         servers = {
             m: sandbox for m, sandbox in sandboxes.items() if isinstance(sandbox, RemoteSandbox)
         }
-        with self._asking:  # who comes next finds the answers
+        with self._asking:  # a thread that waits here then uses the fresh answers
             now = monotonic()
             stale = [server for server in servers if self._is_stale(server, now)]
             calls = [partial(remote.ask_facts, servers[server]) for server in stale]
@@ -78,7 +78,7 @@ class Rooms:
 
     def _is_stale(self, member: Member, now: float) -> bool:
         at, pending = self._pending.get(member, (0.0, None))
-        # one that has not answered yet is still being asked
+        # a request without an answer is still running: do not ask again
         return pending is None or (pending.done and now - at > _FRESH_S)
 
     def _room(self, member: Member) -> Room:
@@ -98,24 +98,24 @@ class Rooms:
 
 
 _ASKED = 32
-"""Servers that are asked for their room at the same time."""
+"""The number of servers that are asked for their room at the same time."""
 ASK_S = 10.0
-"""For how long further servers are asked for the place of one worker, where none has room."""
+"""While no server has room for a worker, further servers are asked for so many seconds."""
 Resolve = Callable[["str | Sandbox"], Sandbox]
 
 
 def _key(entry: str | Sandbox) -> str | int:
-    """What identifies an entry of the list."""
+    """Return the identity of an entry of the list."""
     return entry if isinstance(entry, str) else id(entry)
 
 
 class Placement:
-    """The places of the workers of one ``make_env``. Thread-safe.
+    """Chooses the places of the workers of one ``make_env``. Thread-safe.
 
     Args:
-        places: As the caller names them.
-        resolve: Makes a sandbox of a place's name.
-        runtime: Makes what the jails of a place run on.
+        places: The caller's list.
+        resolve: Makes the sandbox of an entry of the list.
+        runtime: Makes the runtime of a place's jails.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class Placement:
         self._run_by: tuple[list[Member], Runtime] | None = None
 
     def members(self) -> list[Member]:
-        """The places, each once, with its weight. Raises ``EnvHubError``: one is none."""
+        """Return each place once, with its weight. Raises ``EnvHubError``: an entry is invalid."""
         with self._lock:
             if not self._members:
                 named = {_key(entry): entry for entry in self._places}
@@ -150,15 +150,15 @@ class Placement:
             return list(self._members)
 
     def seats(self, num_workers: int | None) -> list[Seat]:
-        """One for each worker; by default as many as the list has places."""
+        """Make a seat for each worker; by default one for each entry of the list."""
         count = num_workers or sum(member.weight for member in self.members())
         return [Seat(self, number) for number in range(count)]
 
     def open_for(self, repository: ForRepository, memory_bytes: int) -> None:
-        """Make the places of a repository.
+        """Prepare the places for a repository.
 
-        One that is absent is made when a worker is to go there.
-        ``memory_bytes``: as of ``Rooms``.
+        An absent place is prepared only when a worker is to go there.
+        ``memory_bytes``: see ``Rooms``.
         """
         with self._lock:
             if self._repository is None:
@@ -171,7 +171,7 @@ class Placement:
                 self._repository = repository
 
     def runs_on(self, runtime: Runtime) -> Runtime:
-        """What runs it, on all places together."""
+        """Return a runtime that stands for those of all places."""
         with self._lock:  # each of a thousand workers asks, and there may be a thousand places
             members = self._open_ones()
             if self._run_by is None or self._run_by[0] != members:
@@ -179,11 +179,11 @@ class Placement:
             return self._run_by[1]
 
     def retry_s(self) -> float:
-        """For how long a worker waits for room: the longest of all places."""
+        """Return the seconds that a worker waits for room: the largest value of all places."""
         return max(member.retry_s for member in self._members or self.members())
 
     def at(self, number: int) -> Member:
-        """Where a worker is, or will be as far as is known."""
+        """Return the place of a worker, or a guess before it has been placed."""
         with self._lock:
             if number not in self._at:
                 members = self._open_ones()
@@ -191,7 +191,7 @@ class Placement:
             return self._at[number]
 
     def candidates(self, number: int) -> Iterator[Member]:
-        """Where a worker may go: the best place first, each of the others if that has refused."""
+        """Yield the places for a worker: the best first, then the others if it refuses."""
         tried: list[Member] = []
         took = False
         for places in (self.members, self._open_ones):
@@ -205,12 +205,12 @@ class Placement:
                 return
 
     def _best(self, number: int, members: list[Member]) -> Member:
-        """The best of these, and note that the worker goes there."""
+        """Choose the best of these places, and record that the worker goes there."""
         order = {member: place for place, member in enumerate(members)}
         with self._lock:
             members = sorted(members, key=self._ranks(number, order, {}))
-        # some are asked, and more only if none of these has room: there may be a thousand, which
-        # do not even answer
+        # ask _ASKED servers, and further ones only if none of these has room: a list may have a
+        # thousand servers that do not answer
         until = monotonic() + ASK_S
         for some in (members[start : start + _ASKED] for start in range(0, len(members), _ASKED)):
             rooms = self._rooms.ask(some) if self._rooms and len(members) > 1 else {}
@@ -224,13 +224,13 @@ class Placement:
         raise AssertionError("there are no places")
 
     def _open_ones(self) -> list[Member]:
-        """Those that are made for the repository; before that all."""
+        """Return the places that are prepared for the repository; all if none is."""
         members = self._members or self.members()
         opened = [member for member in members if member.is_open]
         return opened or members
 
     def _opens(self, number: int, member: Member) -> bool:
-        """Whether a worker can go there; one that was absent is made for the repository."""
+        """Whether a worker can go to a place; prepares an absent place for the repository."""
         try:
             if self._repository is not None:
                 member.open_for(self._repository)
@@ -244,7 +244,7 @@ class Placement:
     def _ranks(
         self, number: int, order: dict[Member, int], rooms: dict[Member, Room]
     ) -> Callable[[Member], tuple[object, ...]]:
-        """What the best place for a worker has least of."""
+        """Return a key for sorting places: the best place for the worker has the least key."""
         placed: dict[Member, list[float]] = {}
         for worker, at in self._at.items():
             if worker != number:
@@ -260,17 +260,17 @@ class Placement:
 
 
 def _all_together(each: Iterable[Runtime]) -> Runtime:
-    """One that stands for all: that of places that are alike, or else a name of them together."""
+    """Return the runtime that all places share, or a hash that stands for different ones."""
     runtimes = sorted(set(each), key=attrgetter("python", "packages"))
     if len(runtimes) == 1:
         return runtimes[0]
-    # it is looked up as a path, which thousands of addresses are too long for
+    # a hash, because the name is looked up as a path, and thousands of addresses are too long
     digest = hashlib.sha256(repr([tuple(runtime) for runtime in runtimes]).encode())
     return Runtime(f"fleet/of/{digest.hexdigest()}")
 
 
 class Seat(Sandbox):
-    """The place of one worker of a fleet, wherever that is at present."""
+    """The sandbox of one worker of a fleet; its place may change."""
 
     name = "fleet"
 
@@ -280,7 +280,7 @@ class Seat(Sandbox):
 
     @property
     def retry_s(self) -> float:  # type: ignore[override]
-        """The longest of all places."""
+        """See ``Placement.retry_s``."""
         return self._placement.retry_s()
 
     @property
@@ -291,7 +291,7 @@ class Seat(Sandbox):
     def for_repository(
         self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
     ) -> Seat:
-        """See ``Sandbox``; ``runtime`` is each place's own."""
+        """See ``Sandbox``; each place uses its own runtime instead of ``runtime``."""
 
         def at(place: Sandbox, runtime: Runtime) -> Sandbox:
             return place.for_repository(snapshot, policy, runtime, assets)
@@ -310,5 +310,5 @@ class Seat(Sandbox):
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
     ) -> ServerUse[WorkerServer]:
-        """See ``Sandbox``: where it is."""
+        """See ``Sandbox``: acquires a server at the worker's present place."""
         return self._placement.at(self._number).acquire(store, runtime, idle_s)

@@ -1,11 +1,11 @@
-"""What runs on a node of a Ray cluster: an actor that starts a worker server beside it.
+"""The actor that runs on a node of a Ray cluster and starts a worker server beside it.
 
-Ray finds it there by its name, so the nodes have this package installed. The server has a pidfd of
-the actor's process and ends with it, whatever ended that: Ray kills an actor when its driver, its
-node or the head has gone, and knows nothing of processes that the actor has started.
+Ray imports this class by name, so the nodes need this package. The server has a pidfd of the
+actor's process, and ends whenever that process ends. Ray kills an actor when its driver, its node
+or the head has gone, but does not know the processes that the actor has started.
 
-What goes through Ray is the client's public key on the way in, and JSON as bytes on the way out,
-which Ray hands over without a pickle.
+Ray carries only the client's public key to the actor, and JSON as bytes back, which needs no
+pickle.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ _TAIL_BYTES = 4000
 
 
 class WorkerActor:
-    """One worker server, on the node that this runs on; its life is the actor's."""
+    """Starts one worker server on the actor's node; the server ends with the actor."""
 
     def __init__(self) -> None:
-        self._log = tempfile.TemporaryFile()  # noqa: SIM115, it goes with this process
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115, deleted when this process ends
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self, client_key: str) -> bytes:
         """Start the server.
-        ``client_key``: the public key of its one client, as text.
+        ``client_key``: the public key of the server's only client, as text.
 
-        Returns a JSON object: ``endpoint``, ``key`` (the server's public one), ``node`` (its id)
-        and ``gpus`` (those that Ray has assigned, by index); or ``error``, a text.
+        Returns a JSON object: ``endpoint``, ``key`` (the server's public key), ``node`` (the node's
+        id) and ``gpus`` (the indices of the GPUs that Ray has assigned); or ``error``, a text.
         """
         try:
             return json.dumps(self._started(client_key)).encode()
-        except Exception as error:  # raised here, it would be a pickle there
+        except Exception as error:  # Ray would pickle an error that is raised here
             return json.dumps({"error": f"{type(error).__name__}: {error}"}).encode()
 
     def wait(self) -> bytes:
-        """Wait until the server ends. Returns a JSON object: ``code``, its exit code, and ``log``,
-        the end of what it has printed.
+        """Wait until the server ends. Returns a JSON object: ``code``, the server's exit code, and
+        ``log``, the end of its output.
         """
         assert self._process is not None
         code = self._process.wait()
@@ -76,7 +76,7 @@ class WorkerActor:
         return {"endpoint": words[0], "key": words[1], "node": node, "gpus": gpus}
 
     def _executed(self, bind: str, client_key: str, ready: int) -> subprocess.Popen[bytes]:
-        # whoever may start an actor may do anything here: there is nothing to forbid this client
+        # a client that may start an actor may run any code here, so limits would protect nothing
         permitted = ("--weakest-profile=container", "--allow-network", "--allow-gpu")
         with pidfd() as ourselves:
             return subprocess.Popen(
@@ -90,7 +90,7 @@ class WorkerActor:
                 stdout=self._log,
                 stderr=self._log,
                 cwd="/",
-                # without Ray's token, above all
+                # this environment leaves out Ray's token
                 env={**index.environment(), "OPENBLAS_NUM_THREADS": "1"},
                 pass_fds=(ready, ourselves),
                 start_new_session=True,

@@ -1,7 +1,7 @@
-"""Ray itself, as far as this package uses it: the connection, an actor, its answers and its end.
+"""The calls to Ray: connects a process, starts an actor, reads its answers, and reports its end.
 
-Trust: a node is its operator's, and what an actor answers is plain data that is checked here. Ray's
-own texts are shown, and nothing else of them is used.
+Trust: a node belongs to its operator. An actor's answers are plain data, which this module checks.
+Ray's own texts are only shown.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from envhub_worker.protocol.text import printable
 _MOST_BYTES = 65_536
 _SHOWN_CHARS = 2_000
 _GUESSES = "Some common causes include"
-"""From here on an error of Ray's is about any death, and not about this one."""
+"""Ray's errors list general causes from these words on, which end_text leaves out."""
 _connecting = threading.RLock()  # interruption.md, rule 12
 
 
 def check_installed() -> None:
-    """Raises ``SandboxUnavailableError``: this interpreter has no Ray."""
+    """Raise ``SandboxUnavailableError`` if this interpreter has no Ray."""
     if importlib.util.find_spec("ray") is None:
         raise SandboxUnavailableError(
             f"{option_name('sandbox', 'ray')} needs Ray, which this interpreter does not have: "
@@ -44,7 +44,7 @@ def check_installed() -> None:
 
 
 def name(address: str) -> str:
-    """What a cluster is called, of this Python; connects to nothing."""
+    """Return a text that names the cluster and this Python version; connects to nothing."""
     import ray
 
     if ray.is_initialized():
@@ -53,11 +53,11 @@ def name(address: str) -> str:
 
 
 def connect(address: str = "") -> None:
-    """Use the Ray that this process is connected to, or connect it.
-    ``address``: as ``ray.init`` takes it; without one a cluster that runs already, and else a local
-    one is started, with a warning that says so.
+    """Connect this process to a Ray cluster, unless it is connected.
+    ``address``: as in ``ray.init``. If it is empty, the process connects to a running cluster; if
+    there is none, it starts a local one and warns.
     Raises ``PolicyError``: the process is connected to another cluster;
-    ``SandboxUnavailableError``: Ray does not come up, or no cluster is there.
+    ``SandboxUnavailableError``: Ray does not start, or there is no cluster at the address.
     """
     check_installed()
     import ray
@@ -100,25 +100,25 @@ def _check_address(address: str, connected: str) -> None:
 
 
 def job() -> str | None:
-    """This process's connection to Ray, which each ``ray.init`` makes anew; None without one."""
+    """Return the id of this process's job, which each ``ray.init`` makes anew; None without one."""
     import ray
 
     return str(ray.get_runtime_context().get_job_id()) if ray.is_initialized() else None
 
 
 class PlacedActor:
-    """An actor with a worker server, of this process.
-    ``options``: how Ray places it, as ``ActorClass.options`` takes them.
+    """An actor with a worker server, started by this process.
+    ``options``: arguments of ``ActorClass.options``, by which Ray places the actor.
     """
 
     def __init__(self, options: Mapping[str, Any]) -> None:
         import ray
 
-        # late: it runs on the nodes, on Linux, and a client need not
+        # late, because the actor's module is for nodes, which run Linux; a client may run another
         from envhub_sandbox.extras.ray.actor import WorkerActor
 
         self._job = job()
-        # not restarted: it would be another server, with other keys, which we start ourselves
+        # no restart by Ray, whose new server would have other keys: the client starts a new one
         remote = ray.remote(max_restarts=0, max_task_retries=0)(WorkerActor)
         try:
             self._handle = remote.options(**options).remote()
@@ -129,8 +129,8 @@ class PlacedActor:
         self._ended: Callable[[], object] = lambda: None
 
     def start(self, client_key: str, within_s: float) -> dict[str, Any]:
-        """Have it started, once Ray has placed it.
-        Raises ``ServerBusyError``: Ray finds no place in time; ``SandboxUnavailableError``: a node
+        """Have the actor start its server, once Ray has placed the actor; returns its answer.
+        Raises ``ServerBusyError``: Ray finds no node in time; ``SandboxUnavailableError``: a node
         cannot make the ``runtime_env``; ``WorkerStartupError``: the actor or the server has ended.
         """
         import ray
@@ -151,7 +151,7 @@ class PlacedActor:
         return said
 
     def watch(self, ended: Callable[[], object]) -> None:
-        """Have ``ended`` called, in any thread, once the server or the actor has ended."""
+        """Call ``ended``, in any thread, once the server or the actor has ended."""
         self._ended = ended
         self._ask()
 
@@ -163,19 +163,19 @@ class PlacedActor:
         import ray
 
         if isinstance(answer.exception(), ray.exceptions.ActorUnavailableError):
-            with contextlib.suppress(Exception):  # Ray has been shut down
-                self._ask()  # it may live: Ray says when it knows
+            with contextlib.suppress(Exception):  # raised if Ray has been shut down
+                self._ask()  # the actor may still live: wait again
                 return
         self._end.set_result(answer)
         self._ended()
 
     @property
     def runs(self) -> bool:
-        """Whether it has not ended, as far as Ray has said."""
+        """Whether Ray has not reported the end of the server or the actor."""
         return not self._end.done() and job() == self._job
 
     def end_text(self, wait_s: float) -> str:
-        """How it ended, in Ray's words or the server's; waits so long for them."""
+        """Describe the end in Ray's words or the server's; waits at most ``wait_s`` for them."""
         if job() != self._job:
             return "ray.shutdown() was called in this process, which ends its actors"
         try:
@@ -187,13 +187,13 @@ class PlacedActor:
             return f"Ray says: {_one_line(str(error).partition(_GUESSES)[0])}"
         try:
             said = read_answer(answer.result())
-        except WorkerStartupError as error:  # whoever asks has an error of their own
+        except WorkerStartupError as error:  # the caller of this reports another error
             return str(error)
         code, log = _one_line(str(said.get("code"))), _one_line(str(said.get("log")))
         return f"it ended with {code}: {log}"
 
     def kill(self) -> None:
-        """End it, and with it its server. Idempotent; nothing after ``ray.shutdown``."""
+        """End the actor, and with it the server. Idempotent; no effect after ``ray.shutdown``."""
         import ray
 
         if job() == self._job:
@@ -201,7 +201,7 @@ class PlacedActor:
 
 
 def read_answer(answer: object) -> dict[str, Any]:
-    """An actor's answer. Trust: input from a node. Raises ``WorkerStartupError``: it is none."""
+    """Parse an actor's answer. Trust: input from a node. Raises ``WorkerStartupError``: invalid."""
     try:
         if type(answer) is bytes and len(answer) <= _MOST_BYTES:
             said = json.loads(answer)

@@ -1,9 +1,9 @@
 """``sandbox="ray"``: a worker server on a node of a Ray cluster, for each worker of a ``make_env``.
 
-Ray places an actor, which starts an ``envhub-worker listen`` beside it (``actor.py``). From then on
-it is a server on another host: the repository's files travel from here and steps go straight over
-ZeroMQ with CURVE keys. Ray's own channel carries both public keys; the secret ones stay where they
-were made, and live as long as the actor.
+Ray places an actor, which starts an ``envhub-worker listen`` beside it (``actor.py``). The client
+then uses it as a server on another host: it uploads the repository's files, and steps travel over
+ZeroMQ with CURVE keys. Ray carries only the two public keys. Client and server each keep their
+secret key, which they make for this actor.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from envhub_worker.protocol.runtime import OWN, Runtime
 _NODE_CHARS = 12
 _MOST_GPUS = 1 << 16
 _KEPT_S = 60.0
-"""A server that has made packages waits for so long for the jail that needs them."""
+"""Seconds for which a server that has made packages stays idle, until a jail needs them."""
 _FATE_S = 30.0
-"""For so long an error waits for Ray, which takes some 20 s to see that a node has gone."""
+"""Seconds for which an error waits for Ray's reason: Ray notices a lost node after some 20 s."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -52,19 +52,19 @@ class RaySandbox(Sandbox):
 
     Attributes:
         num_cpus: CPUs that Ray reserves for each actor; fractions are permitted.
-        num_gpus: GPUs that Ray reserves for each; a policy with ``gpu=True`` grants those that Ray
-            assigns.
-        resources: The cluster's own resources to reserve for each, as in ``{"simulator": 1}``.
-        scheduling_strategy: ``"SPREAD"`` takes the nodes in turn, ``"DEFAULT"`` fills some first;
-            or an object of Ray's, such as
+        num_gpus: GPUs that Ray reserves for each actor; a policy with ``gpu=True`` grants the GPUs
+            that Ray assigns.
+        resources: Custom resources that Ray reserves for each actor, as in ``{"simulator": 1}``.
+        scheduling_strategy: ``"SPREAD"`` uses the nodes in turn, ``"DEFAULT"`` fills some first;
+            or one of Ray's objects, such as
             ``ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy``.
-        runtime_env: What the node prepares, as in ``{"pip": ["envhub-sandbox[ray]"]}``.
-        address: As in ``ray.init``, for a process that has not called it; by default the cluster
-            that runs already, otherwise a local one.
+        runtime_env: Ray's runtime environment, as in ``{"pip": ["envhub-sandbox[ray]"]}``.
+        address: As in ``ray.init``, for a process that has not called it; by default a running
+            cluster, otherwise a local one.
         placement_s: Seconds to wait until Ray has placed and started the server. A cluster that
             scales itself may need minutes.
-        shared: One server for all environments of this process that use this object, and for
-            their workers.
+        shared: Use one server for all environments of this process that use this object, and for
+            all their workers.
         heartbeat_s: As in ``RemoteSandbox``.
     """
 
@@ -91,19 +91,19 @@ class RaySandbox(Sandbox):
                 raise PolicyError(f"RaySandbox: {option} is {value!r}; it takes seconds above 0")
 
     def workers(self, num_workers: int | None) -> list[RaySandbox]:
-        """See ``Sandbox``: each asks for a server of its own, and where that runs, Ray decides."""
+        """See ``Sandbox``: each worker has its own server, unless ``shared``; Ray chooses nodes."""
         return [self] * (1 if self.shared else num_workers or 1)
 
     def __reduce__(self) -> Any:
-        """Without the servers, which are this process's."""
+        """Pickle only the arguments: the servers belong to this process."""
         given = {option.name: getattr(self, option.name) for option in fields(self) if option.init}
         return _made, (given,)
 
     def for_repository(
         self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
     ) -> RayRepository:
-        """The place for one repository. Starts nothing, and connects to nothing.
-        Raises ``PolicyError``: the policy names what a client of another host cannot have;
+        """Return the sandbox for one repository. Starts nothing, and connects to nothing.
+        Raises ``PolicyError``: the policy asks for something that no node can give;
         ``SandboxUnavailableError``: Ray is not installed.
         """
         cluster.check_installed()
@@ -119,18 +119,18 @@ class RaySandbox(Sandbox):
         return RayRepository(snapshot, order, runtime.packages, self)
 
     def package_target(self) -> ServerPackages:
-        """The server makes packages itself, on its node, and is then the repository's."""
+        """See ``Sandbox``: a server makes the packages on its node, and then serves its jails."""
         return ServerPackages(lambda: self.server_for(None, _KEPT_S), self._orders)
 
     def server_for(
         self, repository: RayRepository | None, idle_s: float | None
     ) -> ServerUse[RayServer]:
-        """A server, placed and started if there is none; raises as ``RayServer``."""
+        """Acquire a server; starts one if there is none. Raises as ``RayServer``."""
         group = None if self.shared else repository
         return SERVERS.acquire(self, partial(_placed, self), idle_s, group)
 
     def placement(self) -> dict[str, Any]:
-        """How Ray places an actor, as its ``options`` take it."""
+        """Return the arguments of ``ActorClass.options``, by which Ray places an actor."""
         wanted = {
             "num_cpus": self.num_cpus,
             "num_gpus": self.num_gpus,
@@ -147,7 +147,7 @@ def _made(given: dict[str, Any]) -> RaySandbox:
 
 @dataclass(eq=False)
 class RayRepository(UploadedRepository):
-    """The sandbox of one repository for one worker: a server, which its environments share."""
+    """The sandbox of one repository for one worker: its environments share a server."""
 
     name = "ray"
     options: RaySandbox
@@ -155,11 +155,11 @@ class RayRepository(UploadedRepository):
 
     @property
     def address(self) -> str:
-        """The node of its server, once it has had one."""
+        """See ``Sandbox``: the node of the last server; before the first one ``"ray"``."""
         return f"Ray's node {self._node}" if self._node else self.name
 
     def runs_on(self, runtime: Runtime) -> Runtime:
-        """The cluster, what its nodes prepare, and the packages that were made there."""
+        """See ``Sandbox``: names the cluster, the ``runtime_env``, and the packages made there."""
         prepared = json.dumps(self.options.runtime_env, sort_keys=True, default=repr)
         where = cluster.name(self.options.address)
         return Runtime(f"{where}, {prepared}{self.packages and f' {self.packages}'}")
@@ -167,7 +167,7 @@ class RayRepository(UploadedRepository):
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
     ) -> ServerUse[RayServer]:
-        """The repository's server, placed by Ray and started if there is none."""
+        """Acquire the repository's server; Ray places and starts one if there is none."""
         use = self.options.server_for(self, idle_s)
         self._node = use.server.node[:_NODE_CHARS]
         return use
@@ -175,7 +175,7 @@ class RayRepository(UploadedRepository):
     def prepare(
         self, order: m.OpenJail, server: WorkerServer, client: WorkerConnection, deadline: Deadline
     ) -> m.OpenJail:
-        """Bring the files there; a GPU is one that Ray has assigned."""
+        """Upload the files, and grant only the GPUs that Ray has assigned."""
         order = super().prepare(order, server, client, deadline)
         if not order.confinement["gpu"]:
             return order
@@ -184,11 +184,11 @@ class RayRepository(UploadedRepository):
 
 
 class RayServer(remote.RemoteServer):
-    """A worker server on a node, with the actor that it lives as long as.
+    """A worker server on a node, which lives as long as its actor.
 
     Attributes:
         node: The node's id, in hexadecimal digits.
-        gpus: Those of the node that Ray has assigned.
+        gpus: The indices of the node's GPUs that Ray has assigned.
 
     Raises as ``cluster.connect`` and ``PlacedActor.start``.
     """
@@ -214,29 +214,29 @@ class RayServer(remote.RemoteServer):
 
     @property
     def runs(self) -> bool:
-        """Whether it has not ended, as far as Ray has said."""
+        """See ``PlacedActor.runs``."""
         return self._actor.runs
 
     def stop(self) -> None:
-        """Close what is open there, and end the actor, with which the server ends; as
-        ``WorkerServer``.
+        """See ``WorkerServer``: close the open jails, and end the actor, with which the server
+        ends.
         """
         if not self._owner.is_here:
             return
         if not self.runs:
-            self._wake()  # there is no answer to wait for
+            self._wake()  # an ended server answers no more: end the waits for it
         super().stop()
         self._actor.kill()
 
 
 def _placed(options: RaySandbox) -> RayServer:
-    SERVERS.stop_idle()  # which may be where there is room
+    SERVERS.stop_idle()  # idle servers may hold the resources that this one needs
     return RayServer(options)
 
 
 SERVERS: ServerPool[RayServer] = ServerPool()
 RAY = RaySandbox()
-"""What ``sandbox="ray"`` means."""
+"""The sandbox of ``sandbox="ray"``."""
 
 
 def _is_gpu(number: object) -> bool:
@@ -244,9 +244,9 @@ def _is_gpu(number: object) -> bool:
 
 
 def read_started(said: Mapping[str, Any]) -> tuple[str, bytes, str, tuple[int, ...]]:
-    """What an actor says of its server: endpoint, public key, node, GPUs.
+    """Read an actor's answer about its server: endpoint, public key, node, GPUs.
 
-    Trust: input from a node. Raises ``WorkerStartupError``: it says something else.
+    Trust: input from a node. Raises ``WorkerStartupError``: the answer is invalid.
     """
     try:
         endpoint, key, node, gpus = (said[name] for name in ("endpoint", "key", "node", "gpus"))

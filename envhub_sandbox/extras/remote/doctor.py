@@ -1,4 +1,4 @@
-"""``envhub doctor tcp://HOST:PORT``: what a server says, if it lets us in."""
+"""``envhub doctor tcp://HOST:PORT``: asks a server for its facts and prints them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _USED = {
     "upload_bytes": "upload_bytes",
     "inflight_bytes": "inflight_bytes",
 }
-"""Quotas, and what is used of them, by their names in the figures."""
+"""For each quota the name of its use in the server's figures."""
 
 
 def examine_server(server: RemoteSandbox, profile: str, *, json: bool) -> Exit:
-    """Ask a server and print what it says; the exit code is that of the profile.
-    Raises ``EnvHubError``: it is not reached, or does not let us in.
+    """Print a server's facts. The exit code says whether the server can enforce the profile.
+    Raises ``EnvHubError``: the server cannot be reached, or rejects this client.
     """
     facts = ask_facts(server)
     code, problem = _verdict(facts, profile)
@@ -47,7 +47,7 @@ def _verdict(facts: ServerFacts, profile: str) -> tuple[Exit, str | None]:
 
 
 def print_facts(server: RemoteSandbox, facts: ServerFacts, problem: str | None) -> None:
-    """Print what a server says, and what keeps it from having a jail. Trust: the server's word."""
+    """Print a server's facts, and why it can open no jail. Trust: the facts are unverified."""
     release = f"envhub-worker {facts.version}, protocol {facts.protocol}"
     out(f"{safe_line(server.endpoint)}: {release}", "bold")
     let_in = "asks for no key" if server.insecure_loopback else "knows our key"

@@ -1,4 +1,4 @@
-"""Addresses of servers on other hosts, and the keys by which each side knows the other."""
+"""Addresses of servers on other hosts, and the keys by which client and server authenticate."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ SERVER_KEY_VARIABLE = "ENVHUB_SERVER_KEY"
 CLIENT_KEY_VARIABLE = "ENVHUB_CLIENT_KEY"
 CONFIG_VARIABLE = "ENVHUB_CONFIG"
 _HOST = re.compile(r"[a-z0-9_.:%;-]+")
-"""What ZeroMQ connects to; of others it says nothing that names the endpoint."""
+"""Host names that ZeroMQ accepts; its errors about other names do not say the endpoint."""
 _MAX_FILE_CHARACTERS = 1 << 20
 
 
 def address_of(endpoint: str) -> str:
-    """``host:port`` of an endpoint. Raises ``PolicyError``: it is none."""
+    """Return the ``host:port`` of an endpoint. Raises ``PolicyError``: it is not ``tcp://...``."""
     if "@" in endpoint:
         raise PolicyError(
             "sandbox: a remote server identifies clients by their keys; leave out the login "
@@ -48,7 +48,7 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def config_folder() -> Path:
-    """``$ENVHUB_CONFIG``, or the user's configuration folder for ``envhub-sandbox``."""
+    """Return ``$ENVHUB_CONFIG``, or the user's configuration folder for ``envhub-sandbox``."""
     chosen = os.environ.get(CONFIG_VARIABLE)
     if chosen:
         return Path(chosen).expanduser().absolute()
@@ -58,8 +58,8 @@ def config_folder() -> Path:
 
 
 def server_key(endpoint: str, given: str | None) -> bytes:
-    """A server's public key: given, in the environment, or in ``known_hosts``.
-    Raises ``SandboxUnavailableError``: there is none; ``PolicyError``: it is no key.
+    """Find a server's public key: the argument, the environment variable, or ``known_hosts``.
+    Raises ``SandboxUnavailableError``: it is in none of these; ``PolicyError``: it is invalid.
     """
     text = given or os.environ.get(SERVER_KEY_VARIABLE) or _known(address_of(endpoint))
     if not text:
@@ -81,15 +81,15 @@ def _known(address: str) -> str | None:
 
 
 def _read(path: Path, what: str) -> str:
-    """As much of a file of keys as a person writes; empty if there is none.
-    Raises ``PolicyError``: it cannot be read.
+    """Read a file of keys; empty if there is no file.
+    Raises ``PolicyError``: the file cannot be read, or is too large.
     """
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
             text = file.read(_MAX_FILE_CHARACTERS + 1)
     except (FileNotFoundError, NotADirectoryError):
         return ""
-    except (OSError, ValueError) as error:  # the latter: a name with a null character
+    except (OSError, ValueError) as error:  # ValueError: the name has a null character
         raise PolicyError(f"{what}: {error}") from error
     if len(text) > _MAX_FILE_CHARACTERS:
         raise PolicyError(f"{what}: {path} is larger than {_MAX_FILE_CHARACTERS >> 20} MiB")
@@ -97,25 +97,25 @@ def _read(path: Path, what: str) -> str:
 
 
 def is_key_file(key: str | os.PathLike[str] | None) -> bool:
-    """Whether it names a key's file, and is not the key."""
+    """Whether a text names a key's file, and is not the key itself."""
     if not isinstance(key, str):
         return key is not None
     try:
         parse_key(key)
     except ValueError:
-        return os.sep in key  # anything else may be a key that was mistyped
+        return os.sep in key  # without a separator it may be a mistyped key
     return False
 
 
 def client_key(given: str | os.PathLike[str] | None) -> bytes:
-    """Our secret key: given, in the environment, or in its file; raises as ``server_key``."""
+    """Find the client's secret key: argument, variable or file; raises as ``server_key``."""
     default = config_folder() / "client.key"
     named = given or os.environ.get(CLIENT_KEY_VARIABLE) or default
     if not is_key_file(named) and not _is_file(named):
         return _parsed(os.fspath(named), "client_key")
     if text := _read(Path(os.path.expanduser(named)), "client_key"):
         return _parsed(text, "client_key")
-    if named is not default:  # without its name, which may be a key that was mistyped
+    if named is not default:  # the error leaves the text out, because it may be a mistyped key
         raise PolicyError("client_key: it names a file that is empty or not there, or is no key")
     raise SandboxUnavailableError(
         "a remote server accepts only clients with a listed key, and this client has no key: "
@@ -128,7 +128,7 @@ def client_key(given: str | os.PathLike[str] | None) -> bytes:
 def _is_file(text: str | os.PathLike[str]) -> bool:
     try:
         return os.path.isfile(text)
-    except ValueError:  # it holds a null character
+    except ValueError:  # the text has a null character
         return False
 
 

@@ -1,8 +1,8 @@
-"""One repository on another host: what its server is sent, and what it says.
+"""One repository on another host: uploads its files, and has the server make its packages.
 
-A snapshot's files go there by hash, and only missing ones. Whether packages are installed there the
-server's operator decides. What is declared is read here, and again there; what is made lies there,
-and no file of it comes here.
+The client uploads a snapshot's files by hash, and only those that the server lacks. The server's
+operator decides whether packages are installed there. Client and server both read the declared
+requirements. The server keeps the packages that it makes; no file of them comes to the client.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ if TYPE_CHECKING:
     from envhub_sandbox.extras.packages.declared import WantedPackage
 
 PIECE_BYTES = 256 * 1024
-"""Small enough that a heartbeat does not wait long behind it."""
+"""The size of a piece of an upload: small enough that a heartbeat waits only briefly behind it."""
 _WINDOW = 8
-"""Pieces under way: together with the size, what fills a line of some 40 MB/s over 50 ms."""
+"""Unanswered pieces: 8 pieces fill a connection of about 40 MB/s with a latency of 50 ms."""
 
 
 class Sent(NamedTuple):
-    """One file of a listing."""
+    """A file of a snapshot."""
 
     path: str
     size: int
@@ -54,12 +54,12 @@ class Sent(NamedTuple):
 
     @property
     def row(self) -> tuple[object, ...]:
-        """As the server takes it."""
+        """The row of ``OfferSnapshot`` for this file."""
         return tuple(self) if self.executable else tuple(self)[:-1]
 
 
 def listing(root: Path) -> tuple[Sent, ...]:
-    """Every file below a snapshot's root, hashed. Raises ``SnapshotError``."""
+    """Hash every file below a snapshot's root. Raises ``SnapshotError``: one cannot be read."""
     try:
         return tuple(_sent(root, path) for path in sorted(_files(root)))
     except OSError as error:
@@ -84,13 +84,13 @@ def _sent(root: Path, path: Path) -> Sent:
 def upload(
     client: WorkerConnection, root: Path, files: tuple[Sent, ...], deadline: Deadline
 ) -> tuple[str, int]:
-    """Bring files to a server; what it calls the snapshot, and how many bytes had to travel.
-    Raises ``SnapshotIntegrityError``: a file arrived as another than it left; ``WorkerError``: the
-    server does not take them, or took too long.
+    """Upload files. Returns the server's name for the snapshot, and the number of uploaded bytes.
+    Raises ``SnapshotIntegrityError``: a file arrived with another hash; ``WorkerError``: the server
+    rejects the files, or takes too long.
     """
     wanted = _offer(client, files, deadline)
     by_hash = {file.sha256: file for file in files}
-    asked = {sha for sha in wanted.hashes if isinstance(sha, bytes)}  # each once, however often
+    asked = {sha for sha in wanted.hashes if isinstance(sha, bytes)}  # a hash counts once
     missing = [file for sha, file in by_hash.items() if sha in asked]
     if not wanted.hashes:
         return wanted.snapshot, 0
@@ -108,7 +108,7 @@ def _offer(client: WorkerConnection, files: tuple[Sent, ...], deadline: Deadline
 
 
 def _put(client: WorkerConnection, root: Path, missing: list[Sent], deadline: Deadline) -> None:
-    """Send piece after piece, with some under way; the server answers in order."""
+    """Send the pieces, at most ``_WINDOW`` of them unanswered; the server answers in order."""
     under_way: deque[int] = deque()
     for sha256, offset, piece in _pieces(root, missing):
         if len(under_way) >= _WINDOW:
@@ -142,25 +142,24 @@ _MAX_CHARS = 300
 
 @dataclass(frozen=True)
 class ServerPackages:
-    """Packages that a server makes itself: a ``PackageTarget``.
+    """The packages that a server makes itself: a ``PackageTarget``.
 
     Attributes:
-        use: Gives the server.
-        orders: What each was made of, by the server's name for it; what is made is added.
+        use: Acquires the server.
+        orders: The request for each set of packages, by the server's name for the set. ``make``
+            adds to it.
     """
 
     use: Callable[[], ServerUse[WorkerServer]]
     orders: dict[str, m.NeedPackages]
 
     def meets(self, request: PackageRequest) -> bool:
-        """Unknown here: the server looks at its own packages when it is asked for some."""
+        """False, because only the server knows its packages; it compares them in ``make``."""
         return False
 
     def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet | None:
-        """The packages that the server makes; None where its own are enough.
-        Raises ``DependencyError``: they cannot be made; the text says what to change;
-        ``PolicyError``: the server's operator does not permit it; ``ServerBusyError``: others of
-        the same key are at it.
+        """Have the server make the packages; None if its own are enough.
+        Raises as ``request_packages``.
         """
         order = order_of(request)
         use = self.use()
@@ -178,7 +177,7 @@ class ServerPackages:
 
 
 def order_of(request: PackageRequest) -> m.NeedPackages:
-    """What a server is asked for. Raises ``PolicyError`` for a path of this machine."""
+    """Make the message for the server. Raises ``PolicyError``: it names a path of this machine."""
     if os.sep in request.python:
         raise PolicyError(
             f"python in dependencies is {request.python!r}, an interpreter of this machine, and a "
@@ -216,10 +215,10 @@ def request_packages(
     deadline: Deadline,
     tell: Callable[[str], None] = lambda line: None,
 ) -> PackageSet | None:
-    """Have packages made; None where the server's own do.
+    """Have the server make packages, and wait for them; None if its own are enough.
     Raises ``DependencyError``: they cannot be made; the text says what to change; ``PolicyError``:
-    the server's operator does not permit it; ``ServerBusyError``: others of the same key are at it;
-    ``WorkerTimeoutError``: it took too long.
+    the server's operator does not permit it; ``ServerBusyError``: another client with the same key
+    is making packages; ``WorkerTimeoutError``: the server takes too long.
     """
     shown = ""
     while True:
@@ -240,14 +239,14 @@ def request_packages(
 
 
 def _name(name: str) -> str:
-    """What we shall hand back. Trust: the server's word, for the server itself."""
+    """Check the server's name for the packages. Trust: only the server interprets the name."""
     if not 0 < len(name) <= _NAME_CHARS or not name.isalnum():
         raise RemoteProtocolError("the server has packages of a name that is none")
     return name
 
 
 def _facts(facts: dict[str, object], order: m.NeedPackages) -> dict[str, Any]:
-    """What is kept for the provenance. Trust: the server's word, checked for its types alone."""
+    """Return the facts for the provenance. Trust: input from the server; only types are checked."""
     lock, pins = (facts.get(name) for name in _FACTS)
     if not isinstance(lock, str) or not isinstance(pins, (list, tuple)) or len(pins) > _MAX_PINS:
         raise RemoteProtocolError("the server does not say which packages it has made")
@@ -258,7 +257,7 @@ def _facts(facts: dict[str, object], order: m.NeedPackages) -> dict[str, Any]:
 
 
 def _inferred(said: object, order: m.NeedPackages) -> list[dict[str, str]]:
-    """What was taken that nothing declares, of what we have guessed. Trust: the server's word."""
+    """Return our guesses that the server has installed. Trust: input from the server."""
     rows = said if isinstance(said, (list, tuple)) else ()
     modules = {str(row.get("module")) for row in rows[:_MAX_PINS] if isinstance(row, dict)}
     return [
@@ -270,11 +269,11 @@ def _inferred(said: object, order: m.NeedPackages) -> list[dict[str, str]]:
 
 @dataclass(eq=False)
 class UploadedRepository(Sandbox):
-    """The sandbox of one repository, whose files are brought to its server.
+    """The sandbox of one repository, which uploads the repository's files to a server.
 
     Attributes:
-        order: What the packages were made of that the server has made for it; None without any.
-        packages: What the server called them.
+        order: The request for the packages that the server made; None if it made none.
+        packages: The server's name for these packages.
     """
 
     snapshot: Path
@@ -285,7 +284,7 @@ class UploadedRepository(Sandbox):
     def prepare(
         self, order: m.OpenJail, server: WorkerServer, client: WorkerConnection, deadline: Deadline
     ) -> m.OpenJail:
-        """Bring the files there, and see that the packages are. One of our threads at a time."""
+        """Upload the files and check the packages, in one thread of this process at a time."""
         with server.uploading:
             if self.order is not None:
                 self._check_packages(self.order, client, deadline)
@@ -296,7 +295,7 @@ class UploadedRepository(Sandbox):
         return m.replace(order, snapshot=snapshot, python="", packages=self.packages)
 
     def _bring(self, root: Path, client: WorkerConnection, deadline: Deadline) -> str:
-        """What the server calls a folder of files, once it has them."""
+        """Upload a folder of files, and return the server's name for it."""
         if root not in self._files:
             self._files[root] = listing(root)
         return upload(client, root, self._files[root], deadline)[0]
@@ -304,8 +303,8 @@ class UploadedRepository(Sandbox):
     def _check_packages(
         self, order: m.NeedPackages, client: WorkerConnection, deadline: Deadline
     ) -> None:
-        """Have the server make the packages again, if it is a new one or has removed them. That
-        does not count for the timeout of a start.
+        """Have the server make the packages again if it is new or has removed them. This time
+        does not count towards the timeout of a start.
         """
         began = time.monotonic()
         deadline.postpone(_MAKE_S)

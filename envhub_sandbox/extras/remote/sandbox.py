@@ -1,8 +1,8 @@
 """``sandbox="tcp://host:5555"``: the worker on another host, over ZeroMQ with CURVE keys.
 
-There ``envhub-worker listen`` runs. The repository's files travel from here, by content, so the
-server needs neither the Hub nor a token. A thread of ours says that we live; a client that
-has gone loses its jails.
+``envhub-worker listen`` runs there. The client uploads the repository's files, by content, so the
+server needs neither the Hub nor a token. A thread of the client tells the server that the client
+lives; the server closes the jails of a client that has gone.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ class RemoteSandbox(Sandbox):
     """Workers on another host.
 
     Attributes:
-        endpoint: ``tcp://HOST:PORT`` of its ``envhub-worker listen``; ``tcp://HOST:PORT KEY`` has
-            the server's public key, too.
-        server_key: Its public key; by default ``$ENVHUB_SERVER_KEY``, or what ``known_hosts`` in
-            the configuration folder says (a line is ``HOST:PORT KEY``).
-        client_key: Our secret key, or a file that holds it; by default ``$ENVHUB_CLIENT_KEY``
-            (likewise), or ``client.key`` in the configuration folder.
-        insecure_loopback: Without keys, for a server on this machine that has none either.
-        heartbeat_s: After so many seconds without a sign of life the connection counts as lost.
-            On a line where one batch of observations takes longer than that, raise it.
-        retry_s: For how long to wait in line when the server has no room for this key; 0, the
+        endpoint: ``tcp://HOST:PORT`` of the server's ``envhub-worker listen``. ``tcp://HOST:PORT
+            KEY`` includes the server's public key.
+        server_key: The server's public key; by default ``$ENVHUB_SERVER_KEY``, or the server's line
+            ``HOST:PORT KEY`` in ``known_hosts`` in the configuration folder.
+        client_key: The client's secret key, or a file with it; by default ``$ENVHUB_CLIENT_KEY``
+            (a key or a file, too), or ``client.key`` in the configuration folder.
+        insecure_loopback: Use no keys, with a server on this machine that has no keys, either.
+        heartbeat_s: After so many seconds without a heartbeat the connection counts as lost. Raise
+            it if one batch of observations takes longer than this to transfer.
+        retry_s: Seconds to wait in line while the server has no room for this key; 0, the
             default, raises ``ServerBusyError`` at once.
     """
 
@@ -96,7 +96,7 @@ class RemoteSandbox(Sandbox):
         return self.endpoint
 
     def __getstate__(self) -> dict[str, Any]:
-        """No secret key is in a pickle: its reader has one, or the file that is named."""
+        """Leave a secret key out of the pickle, but keep a file's name: the reader has its own."""
         kept = self.client_key if remote_keys.is_key_file(self.client_key) else None
         return {**self.__dict__, "client_key": kept, "_orders": {}}
 
@@ -109,8 +109,8 @@ class RemoteSandbox(Sandbox):
     def for_repository(
         self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
     ) -> RemoteRepository:
-        """The sandbox for one repository. Connects to nothing.
-        Raises ``PolicyError``: the policy names what a client on another host cannot have;
+        """Return the sandbox for one repository. Connects to nothing.
+        Raises ``PolicyError``: the policy names things of this machine; see ``check_policy``;
         ``SandboxUnavailableError``: a key is missing.
         """
         check_policy(policy, runtime)
@@ -119,11 +119,11 @@ class RemoteSandbox(Sandbox):
         return RemoteRepository(*given, self.retry_s)
 
     def package_target(self) -> ServerPackages:
-        """The server makes packages itself."""
+        """See ``Sandbox``: the server makes the packages itself."""
         return ServerPackages(lambda: _use_of(self.endpoint, self.far()), self._orders)
 
     def far(self) -> TcpServer:
-        """The server's key and ours. Raises ``SandboxUnavailableError``: one is missing."""
+        """Find the keys of both sides. Raises ``SandboxUnavailableError``: one is missing."""
         if self.insecure_loopback:
             return TcpServer(None, None, self.heartbeat_s)
         server_key = remote_keys.server_key(self.endpoint, self.server_key)
@@ -131,8 +131,8 @@ class RemoteSandbox(Sandbox):
 
 
 def check_policy(policy: Policy, runtime: Runtime) -> None:
-    """Refuse what names this machine's things; the server would refuse it, too.
-    Raises ``PolicyError``: with what to do instead.
+    """Reject packages, an interpreter and files of this machine; the server would, too.
+    Raises ``PolicyError``: the text says what to do instead.
     """
     if os.sep in runtime.packages:
         raise PolicyError(
@@ -158,7 +158,7 @@ def check_policy(policy: Policy, runtime: Runtime) -> None:
 
 @dataclass(eq=False)
 class RemoteRepository(UploadedRepository):
-    """The sandbox of one repository: its files on the other host."""
+    """The sandbox of one repository on another host."""
 
     name = "remote"
     endpoint: str
@@ -171,20 +171,20 @@ class RemoteRepository(UploadedRepository):
         return self.endpoint
 
     def runs_on(self, runtime: Runtime) -> Runtime:
-        """The server, by its key, and the packages there."""
+        """See ``Sandbox``: names the server, its key, and the packages there."""
         key = "" if self.far.server_key is None else self.far.server_key.hex()
         return Runtime(f"{self.endpoint} {key}{self.packages and f' {self.packages}'}")
 
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
     ) -> ServerUse[RemoteServer]:
-        """The server, which runs anyway; nothing is sent before a jail is opened."""
+        """See ``Sandbox``: the server runs already; this sends nothing."""
         return _use_of(self.endpoint, self.far)
 
 
 class RemoteServer(WorkerServer):
     """A server on another host that environments of this process use.
-    ``process_fd``: readable once we have given it up.
+    ``process_fd``: becomes readable when this process stops using the server.
     """
 
     far: TcpServer
@@ -196,7 +196,7 @@ class RemoteServer(WorkerServer):
         self.uploading = threading.Lock()
         self._owner = OwnerProcess()
         self._ended = False
-        # of sockets, for ZeroMQ waits for nothing else on Windows
+        # a pair of sockets, because ZeroMQ can poll no other descriptors on Windows
         self.process_fd, wakes = (end.detach() for end in socket.socketpair())
         self._wakes = [wakes]
         self._stop = threading.Event()
@@ -206,9 +206,9 @@ class RemoteServer(WorkerServer):
         self._thread.start()
 
     def _keep_alive(self) -> None:
-        """Tell the server that we live, and what we hold; whatever fails is tried again.
+        """Tell the server which jails this living client holds; try again after any failure.
 
-        Without this thread the server would end all jails of a client that lives.
+        Without these messages the server would close the jails of a living client.
         """
         client: WorkerConnection | None = None
         every_s = _FIRST_S
@@ -232,7 +232,7 @@ class RemoteServer(WorkerServer):
                 link.read_ahead()
 
     def _close_jails(self) -> None:
-        """Whatever is open there still: at the end of a process that closed nothing."""
+        """Close the jails that are still open there, when the process ends without closing them."""
         if not self.far.held:
             return
         client, deadline = self._connection(), Deadline(_CLOSE_S)
@@ -245,17 +245,17 @@ class RemoteServer(WorkerServer):
         return WorkerConnection(self.endpoint, self.process_fd, far=self.far)
 
     def _wake(self) -> None:
-        """End every wait for an answer. Any thread; idempotent."""
+        """End every wait for an answer. Any thread may call this; idempotent."""
         with contextlib.suppress(IndexError):
             socket.close(self._wakes.pop())
 
     @property
     def runs(self) -> bool:
-        """Always true; only a request can tell."""
+        """Always true, because only a request shows whether the server runs."""
         return True
 
     def stop(self) -> None:
-        """Close what is open there, and no longer say that we live; as ``WorkerServer``."""
+        """See ``WorkerServer``: close the open jails, and end the thread of keep-alives."""
         if self._ended or not self._owner.is_here:
             return
         self._close_jails()
@@ -263,30 +263,30 @@ class RemoteServer(WorkerServer):
         self._wake()
         self._thread.join(_STOP_S)
         if not self._thread.is_alive():
-            self._ended = True  # once: the number may be somebody else's a moment later
+            self._ended = True  # close only once: another file may get this descriptor's number
             socket.close(self.process_fd)
 
 
 def _close(client: WorkerConnection | None) -> None:
-    """Close a connection, whatever state it is in."""
+    """Close a connection in any state."""
     with contextlib.suppress(Exception):
         if client is not None:
             client.close()
 
 
 SERVERS: ServerPool[RemoteServer] = ServerPool()
-"""Those that this process uses, each once for an endpoint and its keys."""
+"""The servers that this process uses, one for each endpoint with its keys."""
 
 
 def _use_of(endpoint: str, far: TcpServer) -> ServerUse[RemoteServer]:
     return SERVERS.acquire((endpoint, far), partial(RemoteServer, endpoint, far))
 
 
-# --- what a server says about itself, asked without taking a place of its client's
+# --- a server's facts about itself, asked without using up the client's quota
 
 _WAIT_S = 15.0
 _LOOKER = b"status"
-"""The session of a client that only looks; it is not counted."""
+"""The session of a client that only asks for facts; the server does not count it."""
 _WORDS = ("python", "profile", "weakest_profile")
 _MOST = 1 << 63
 _MOST_NAMES = 32
@@ -295,20 +295,20 @@ _MOST_CHARS = 64
 
 @dataclass(frozen=True, kw_only=True)
 class ServerFacts:
-    """What is known of a server. Trust: its own words, checked for their types alone.
+    """A server's facts about itself. Trust: input from the server; only types are checked.
 
     Attributes:
-        protocol: The version that was agreed on.
-        answered_s: From knocking to its welcome.
-        detailed: Whether it says more than that; older servers do not.
-        profile: The strongest that a jail can have there.
-        weakest_profile: That a policy may ask for.
+        protocol: The agreed version of the protocol.
+        answered_s: Seconds from the start of the connection to the server's welcome.
+        detailed: Whether the server reports more than this; older servers do not.
+        profile: The strongest profile of a jail there.
+        weakest_profile: The weakest profile that a policy may ask for.
         network: Whether a policy may ask for the server's network.
-        gpu: Likewise.
-        dependencies: Whether it installs what repositories declare.
-        draining: Whether it is about to end, and lets nothing new in.
-        quotas: What our key may have.
-        used: What it has of that, all its processes together.
+        gpu: Whether a policy may ask for the server's GPUs.
+        dependencies: Whether the server installs the packages that repositories declare.
+        draining: Whether the server is about to end, and accepts nothing new.
+        quotas: The quotas of this client's key.
+        used: How much of them all processes with this key use together.
     """
 
     version: str
@@ -326,7 +326,7 @@ class ServerFacts:
     draining: bool = False
 
     def enforces(self, profile: str) -> bool:
-        """Whether a jail can have a profile there, and may."""
+        """Whether the server can enforce a profile, and its operator permits it."""
         known = (self.profile, profile, self.weakest_profile)
         if not all(profile in PROFILES for profile in known):
             return False
@@ -335,10 +335,10 @@ class ServerFacts:
 
 
 def ask_facts(sandbox: RemoteSandbox) -> ServerFacts:
-    """Ask a server.
-    Raises ``SandboxUnavailableError``: nothing answers there, or it does not let us in;
-    ``VersionMismatchError``: it shares no version of the protocol with us; ``WorkerError``: it
-    refuses to answer.
+    """Ask a server for its facts.
+    Raises ``SandboxUnavailableError``: no server answers, or it rejects this client;
+    ``VersionMismatchError``: server and client share no version of the protocol; ``WorkerError``:
+    the server refuses to answer.
     """
     begun, deadline = monotonic(), Deadline(_WAIT_S)
     with _connection(sandbox) as client:
@@ -359,7 +359,7 @@ def _connection(sandbox: RemoteSandbox) -> Iterator[WorkerConnection]:
 
 
 def facts_of(welcome: m.Welcome, answered_s: float, said: dict[Any, Any]) -> ServerFacts:
-    """What is kept of a server's answer. Trust: input from the server."""
+    """Read a server's facts from its answers. Trust: input from the server."""
     clients = said.get("clients")
     mine: object = next(iter(clients.values()), {}) if isinstance(clients, dict) else {}
     words = {name: _text(said.get(name)) for name in _WORDS}
@@ -383,7 +383,7 @@ def _text(value: object) -> str:
 
 
 def _numbers(value: object) -> dict[str, int]:
-    """The whole numbers of a mapping, by name. Trust: input from the server."""
+    """Return a mapping's integers within bounds, by name. Trust: input from the server."""
     if not isinstance(value, dict):
         return {}
     items = list(value.items())[:_MOST_NAMES]

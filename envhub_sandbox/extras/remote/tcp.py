@@ -1,7 +1,7 @@
-"""A connection to a server on another host: its key, its heartbeat, and what became of it.
+"""A connection to a server on another host: its keys, its heartbeat, and its failures.
 
-libzmq reconnects for ever and says nothing: a wrong key, a port without a listener and a cable
-that is out look alike. Its monitor knows; this turns what it says into errors.
+libzmq reconnects for ever without a message: a wrong key, a port without a listener and an
+unplugged cable look alike. This module turns the events of libzmq's socket monitor into errors.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from envhub_sandbox.transport.replies import UnreachableError
 from envhub_worker.protocol.records import dataclass
 
 CONNECT_S = 10.0
-"""How long a server may take to answer at all, and to come back after the connection was lost."""
+"""Seconds for a server to accept the first connection, or to return after a lost connection."""
 _CUT_S = 3.0
-"""For how long a server may end handshakes until that is no restart any more."""
+"""After a server has ended handshakes for so many seconds, it counts as unreachable."""
 _ANOTHER_PROTOCOL = (
     "it does not speak ZeroMQ with CURVE keys: is it an envhub-worker, and do both sides use "
     "keys, or neither (insecure_loopback)?"
@@ -43,15 +43,15 @@ _EVENTS = (
 
 @dataclass(frozen=True)
 class TcpServer:
-    """A server on another host, as its clients know it.
+    """The keys and the connections of a server on another host.
 
     Attributes:
-        server_key: Its public key; None only for ``insecure_loopback``.
-        client_key: Our secret key; None likewise.
-        heartbeat_s: After so long without a sign of life a connection counts as lost.
-        held: The numbers of the jails that we have open there.
-        links: The connections to it; ``TcpLink.read_ahead`` is called of each every few seconds.
-        why_ended: Says what is known of its end, as the rest of a sentence; may wait some seconds.
+        server_key: The server's public key; None only for ``insecure_loopback``.
+        client_key: This client's secret key; None only for ``insecure_loopback``.
+        heartbeat_s: After so many seconds without a heartbeat a connection counts as lost.
+        held: The numbers of the jails that this process has open on the server.
+        links: The connections; a thread calls ``TcpLink.read_ahead`` of each every few seconds.
+        why_ended: Returns the reason of the server's end, to append to a text; may take seconds.
     """
 
     server_key: bytes | None
@@ -62,29 +62,29 @@ class TcpServer:
     why_ended: Callable[[], str] = field(default=str, compare=False, repr=False)
 
     def link(self, socket: zmq.Socket[bytes], endpoint: str) -> TcpLink:
-        """What watches a socket of ours, before it connects."""
+        """Make the ``TcpLink`` of a socket that has not connected yet."""
         return TcpLink(socket, endpoint, self)
 
     def public_key(self) -> str:
-        """Our public key, as the server's list of clients has it."""
+        """Return this client's public key in the form of the server's ``--authorized-clients``."""
         if self.client_key is None:
             return "none"
         return z85.decode(zmq.curve_public(z85.encode(self.client_key))).hex()
 
 
 def new_keys() -> tuple[bytes, bytes]:
-    """A CURVE key pair, public and secret, of 32 bytes each."""
+    """Make a CURVE key pair: the public and the secret key, of 32 bytes each."""
     public, secret = zmq.curve_keypair()
     return z85.decode(public), z85.decode(secret)
 
 
 class TcpLink:
-    """What is known of one socket's connection. To be made before it connects.
+    """Watches the connection of one socket. It must be made before the socket connects.
 
     Attributes:
-        awaited: The requests that are not answered. While there are any, the socket's owner alone
-            reads what has happened.
-        lock: Held where there may come to be some.
+        awaited: The unanswered requests. While there are any, only the socket's owner reads the
+            monitor's events.
+        lock: A thread holds it while it adds to ``awaited``, or reads events in ``read_ahead``.
     """
 
     def __init__(self, socket: zmq.Socket[bytes], endpoint: str, far: TcpServer) -> None:
@@ -102,8 +102,8 @@ class TcpLink:
         self.lock = threading.RLock()  # interruption.md, rule 12
         self._set_options(socket, far)
         self.monitor = socket.get_monitor_socket(_EVENTS)
-        # a server that ends every connection makes a dozen events a second; where they have no
-        # room, libzmq's thread waits, and with it all connections of this process
+        # a server that ends every connection causes a dozen events a second; with a bounded queue,
+        # a full one would block libzmq's thread, and with it all connections of this process
         self.monitor.setsockopt(zmq.RCVHWM, 0)
         far.links.add(self)
 
@@ -121,15 +121,15 @@ class TcpLink:
             socket.setsockopt(zmq.CURVE_PUBLICKEY, zmq.curve_public(z85.encode(far.client_key)))
 
     def next_number(self) -> int:
-        """The connection that what is sent now travels on."""
+        """Return the number of the connection that carries the next message."""
         self.drain()
         return self._number if self._up else self._number + 1
 
     def read_ahead(self) -> None:
-        """Read the events of a connection that is idle; may be called from any thread.
+        """Read the events of an idle connection; any thread may call this.
 
-        Unread events take memory without a bound if the server ends each new connection. A refusal
-        that is read here is raised by the next use.
+        Unread events take memory without a bound if the server ends each new connection. The next
+        ``drain`` raises a refusal that is read here.
         """
         if not self._owner.is_here or not self.lock.acquire(blocking=False):
             return
@@ -144,11 +144,11 @@ class TcpLink:
             self.lock.release()
 
     def drain(self) -> None:
-        """Read what has happened.
+        """Read the monitor's events.
 
         Raises:
-            SandboxUnavailableError: The server does not let us in, or is another one.
-            WorkerDiedError: The same, after it had let us in before.
+            SandboxUnavailableError: The server rejects this client, or speaks another protocol.
+            WorkerDiedError: The server accepted this client before, and rejects it now.
         """
         if self._refusal is not None:
             refusal, self._refusal = self._refusal, None
@@ -157,8 +157,8 @@ class TcpLink:
 
     def _read(self) -> None:
         if not int(self.monitor.getsockopt(_EVENTS_NOW)) & _READABLE:
-            return  # as nearly always, and without the exception that says so
-        from zmq.utils.monitor import parse_monitor_message  # brings asyncio, and that ssl
+            return  # the usual case; this test is cheaper than zmq.Again
+        from zmq.utils.monitor import parse_monitor_message  # late: it imports asyncio and ssl
 
         while True:
             try:
@@ -185,9 +185,9 @@ class TcpLink:
             self._cut_off()
 
     def _cut_off(self) -> None:
-        """It ended a handshake: libzmq tries again, and so the second or third may succeed.
+        """Raise if the server has ended handshakes for ``_CUT_S``; until then libzmq tries again.
 
-        A server that stops does so as well, and so does a forwarded port with none behind.
+        A stopping server ends handshakes, too, and so does a forwarded port without a server.
         """
         self._cut_since = self._cut_since or monotonic()
         if monotonic() - self._cut_since < _CUT_S:
@@ -207,11 +207,11 @@ class TcpLink:
         return SandboxUnavailableError(text)
 
     def check(self, number: int) -> None:
-        """Raise if the reply to what travelled on that connection can no longer come.
+        """Raise if a reply can no longer come to a message that connection ``number`` carried.
 
         Raises:
             WorkerDiedError: The connection was lost.
-            SandboxUnavailableError: There has never been one.
+            SandboxUnavailableError: No connection has ever succeeded.
         """
         self.drain()
         if number <= self._lost:
@@ -234,7 +234,7 @@ class TcpLink:
         )
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stop watching the connection."""
         with self.lock:
             self._socket.disable_monitor()
             self.monitor.close(0)
