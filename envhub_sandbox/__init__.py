@@ -1,10 +1,10 @@
-"""Environments from the Hugging Face Hub, in a process that holds nothing of yours.
+"""Environments from the Hugging Face Hub, whose code runs in confined processes.
 
     >>> from envhub_sandbox import make_env
     >>> envs = make_env("org/repo@<commit>", n_envs=4)
     >>> obs, infos = envs.env.reset(seed=0)
 
-Importing this package imports nothing heavy: names are looked up when they are used.
+Importing this package is cheap: it imports a name's module when the name is first used.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ __all__ = [*_HOMES]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "__version__":  # it stands where an image without this package finds it, too
+    if name == "__version__":  # there, because a worker's image lacks this package
         return importlib.import_module("envhub_worker").__version__
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""Every error that a caller can get.
+"""The errors that a caller can get.
 
 ::
 
@@ -34,8 +34,8 @@
         RemoteResetNeeded (gymnasium.error.ResetNeeded), ...
 
 A remote exception arrives as text. ``remote_error`` looks up its builtin base class in a fixed
-table, so ``except AttributeError`` works although nothing of the worker is imported. A warning of
-the repository, of any category, is a ``RemoteEnvWarning``.
+table, so ``except AttributeError`` works although nothing of the worker is imported. Every warning
+of the repository is a ``RemoteEnvWarning``.
 """
 
 from __future__ import annotations
@@ -87,11 +87,11 @@ class PolicyError(EnvHubError, ValueError):
 
 
 class BundleError(EnvHubError, ValueError):
-    """This is not a valid crash bundle."""
+    """A crash bundle is not valid."""
 
 
 class VideoError(EnvHubError):
-    """No video can be written: of these frames, to this place, or with what is installed."""
+    """A video cannot be written, because of the frames, the file, or a missing package."""
 
 
 class LockError(EnvHubError, ValueError):
@@ -99,7 +99,7 @@ class LockError(EnvHubError, ValueError):
 
 
 class LockDriftError(LockError):
-    """Something differs from the lock, and is not used.
+    """Files, packages or spaces differ from the lock, and are not used.
 
     Attributes:
         drifts: The differences, one line each.
@@ -131,7 +131,7 @@ class DependencyError(EnvHubError, ModuleNotFoundError):
             ``"integrity"``: a package does not have the expected hash; ``"size"``: the packages
             have more bytes or files than permitted; ``"interpreter"``: no interpreter of this
             machine fits; ``"module"``: the repository imports a module that its interpreter does
-            not have; ``"other"``: the text says it.
+            not have; ``"other"``: the text says the reason.
     """
 
     def __init__(self, message: str, *, reason: DependencyReason = "other") -> None:
@@ -144,7 +144,7 @@ class DependencyError(EnvHubError, ModuleNotFoundError):
 class LoadError(EnvHubError):
     """The repository's entry point cannot be imported, or returned no environment.
 
-    It is also the builtin that LeRobot's loader would raise: ``AttributeError`` without a
+    The error is also the builtin that LeRobot's loader would raise: ``AttributeError`` without a
     ``make_env``, ``ValueError`` if it returned no environment, otherwise the repository's own.
     """
 
@@ -165,9 +165,9 @@ class ServerBusyError(WorkerError):
     Attributes:
         quota: ``"sessions"``, ``"jails"``, ``"runners"``, ``"processes"``, ``"open_files"``,
             ``"disk_files"``, or in bytes ``"memory"``, ``"disk"`` and ``"inflight"``;
-            ``"draining"`` if the server is ending; empty if it did not say.
-        used: How much of it the key uses.
-        limit: How much it may use.
+            ``"draining"`` if the server is ending; empty if the server did not say.
+        used: How much of the quota the key uses.
+        limit: How much the key may use.
         retry_s: Seconds until the client may ask again.
     """
 
@@ -192,9 +192,9 @@ class WorkerDiedError(WorkerError):
             workers ended; ``"unavailable"``: it could not be confined; ``"killed"``: it was
             closed, or given up; ``"idle"``: it was idle for ``idle_s``; ``"server"``: the worker
             server ended; ``"connection"``: the connection to another host was lost; ``"gone"``:
-            the server does not know it any more.
-        log_tail: The last lines of its output, control characters escaped.
-        request: The operation that it was serving (``"step"``), or None.
+            the server does not know the process any more.
+        log_tail: The last lines of the process's output, control characters escaped.
+        request: The operation that the process was serving (``"step"``), or None.
         detail: The numbers, if a limit was the reason.
         repository: The repository, commit and entry file, as in ``org/repo@0123456789ab:env.py``.
         bundle: The folder with everything that led there, for ``envhub replay``, or None.
@@ -252,13 +252,13 @@ class RemoteEnvError(EnvHubError):
         type_name: The class, as the worker named it (``"mypkg.Oops"``).
         message: ``str()`` of the exception.
         traceback: The formatted traceback, with the names of the repository's files.
-        where: Its last line in the repository's own files, under the author's name of the file;
-            may be empty. It is also at the end of ``str()``.
-        file, line: Of that line, with the file's name in the repository; empty and 0 for none.
+        where: The traceback's last line in the repository's own files, with the author's name of
+            the file; may be empty. ``str()`` ends with it.
+        file, line: The file in the repository and the number of that line; empty and 0 for none.
     """
 
     def __init__(self, type_name: str, message: str, traceback: str = "") -> None:
-        # not by the builtin that a twin is as well, which may be made of something else
+        # not super(): a twin's builtin base class may take other arguments
         Exception.__init__(self, f"{type_name}: {continued(message)}" if message else type_name)
         self.type_name = type_name
         self.message = message
@@ -270,7 +270,7 @@ class RemoteEnvError(EnvHubError):
         return (
             remote_error,
             (_builtin_of(type(self)), self.type_name, self.message, self.traceback),
-            {**vars(self), "args": self.args},  # with where it came from
+            {**vars(self), "args": self.args},  # args: the text with its source
         )
 
 
@@ -295,8 +295,8 @@ class RemoteEnvWarning(UserWarning):
 
 __all__ = [name for name in dir() if name.endswith(("Error", "Warning"))]
 
-# A loop of the caller's would end at a StopIteration, and Python prints a SyntaxError without its
-# text. A group has to be made of exceptions.
+# A StopIteration would end a loop of the caller, and Python prints a SyntaxError without its text.
+# A group needs exceptions, so _group makes its twin.
 _WITHOUT_TWIN = (StopIteration, StopAsyncIteration, SyntaxError)
 _BUILTINS: dict[str, type[Exception]] = {
     kind.__name__: kind  # OSError has several names
@@ -323,10 +323,10 @@ _PREFIXES: dict[type[EnvHubError], str] = {RemoteEnvError: "Remote", LoadError: 
 
 
 def _group(kind: Any) -> Any:
-    """A twin of a group of exceptions, of which there must be one: its text by itself."""
+    """Make the twin of a group, which needs an exception: a ``RemoteEnvError`` with its text."""
     twin = _twin(RemoteEnvError, kind)
     twin.__new__ = lambda cls, *given: kind.__new__(cls, given[1], [RemoteEnvError(*given)])
-    # a group's own cannot be set
+    # a group's own message is read-only
     twin.message = property(
         lambda self: vars(self)["message"], lambda self, text: vars(self).update(message=text)
     )
@@ -335,7 +335,7 @@ def _group(kind: Any) -> Any:
 
 _TWINS = {(ours, name): _twin(ours, kind) for ours in _PREFIXES for name, kind in _BUILTINS.items()}
 for _name in ("UnicodeDecodeError", "UnicodeEncodeError", "UnicodeTranslateError"):
-    del _TWINS[LoadError, _name]  # they are made of five arguments, which nothing tells
+    del _TWINS[LoadError, _name]  # their five arguments are not sent
 if hasattr(builtins, "ExceptionGroup"):  # since Python 3.11
     _TWINS[RemoteEnvError, "ExceptionGroup"] = _group(builtins.ExceptionGroup)
 globals().update({twin.__name__: twin for twin in _TWINS.values()})
@@ -344,8 +344,8 @@ _GYMNASIUM = "gymnasium.error"
 
 @cache
 def _gymnasiums() -> dict[str, Any]:
-    """Twins of Gymnasium's own errors, by full name."""
-    module = sys.modules.get(_GYMNASIUM)  # there, where there is an environment
+    """Make twins of Gymnasium's own errors, by full name."""
+    module = sys.modules.get(_GYMNASIUM)  # imported if there is an environment
     kinds = {
         name: kind
         for name, kind in vars(module).items()
@@ -353,12 +353,12 @@ def _gymnasiums() -> dict[str, Any]:
     }
     twins = {f"{_GYMNASIUM}.{name}": _twin(RemoteEnvError, kind) for name, kind in kinds.items()}
     for twin in twins.values():
-        twin.name = ""  # of the call that was pending, which nothing tells
+        twin.name = ""  # Gymnasium's name of the pending call, which is not sent
     return twins
 
 
 def _nearest(ours: type[EnvHubError], builtin: str) -> Any:
-    """The twin of a builtin exception, or of its nearest ancestor that has one."""
+    """Return the twin of a builtin exception, or of its nearest ancestor with a twin."""
     kind = getattr(builtins, builtin, None)
     ancestors = kind.__mro__ if isinstance(kind, type) else ()
     candidates = (_TWINS.get((ours, ancestor.__name__)) for ancestor in ancestors)
@@ -371,7 +371,7 @@ def _builtin_of(cls: type[RemoteEnvError]) -> str:
 
 
 def remote_error(builtin: str, type_name: str, message: str, traceback: str = "") -> RemoteEnvError:
-    """The exception for a remote failure: its class's twin, or plain ``RemoteEnvError``."""
+    """Return the exception for a remote failure: a twin, or a plain ``RemoteEnvError``."""
     twin = _nearest(RemoteEnvError, builtin)
     for name in (builtin, type_name):
         if name.startswith(_GYMNASIUM) and _GYMNASIUM in sys.modules:
@@ -381,18 +381,18 @@ def remote_error(builtin: str, type_name: str, message: str, traceback: str = ""
 
 
 def load_error(builtin: str, message: str) -> LoadError:
-    """The exception for a repository that raised while it was loaded, which is that builtin too."""
+    """Return the ``LoadError`` for a repository that raised a builtin while it was loaded."""
     error: LoadError = _nearest(LoadError, builtin)(message)
     return error
 
 
 def known_reason(text: str) -> DependencyReason:
-    """The reason of a ``DependencyError`` that another process names."""
+    """Return another process's reason for a ``DependencyError``; ``"other"`` if it is unknown."""
     return next((reason for reason in get_args(DependencyReason) if reason == text), "other")
 
 
 def name_source(error: EnvHubError, label: str) -> None:
-    """Prefix an error's text with where it came from, once."""
+    """Prefix an error's text with its repository, commit and entry file, once."""
     text = str(error.args[0]) if error.args else ""
     if not text.startswith(label):
         error.args = (f"{label}: {text}", *error.args[1:])

@@ -1,4 +1,4 @@
-"""``envhub image build``: a worker's image with a repository's packages in it."""
+"""``envhub image build``: builds a worker's image with a repository's packages."""
 
 from __future__ import annotations
 

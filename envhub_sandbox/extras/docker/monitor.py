@@ -1,14 +1,14 @@
-"""The monitor of one container: it holds the container's lifeline, and cleans up after it.
+"""The monitor of one container: ends the container with its client, and cleans up after it.
 
-Run as a script of its own, with ``-I -S`` and the standard library only::
+It runs as a script, with ``-I -S`` and the standard library only::
 
     monitor.py CLIENT_PIDFD READY_FD FOLDER NAME -- ENGINE run ...
 
-It starts the engine's attached ``run`` with a pipe as stdin that no other process holds (a fork of
-the client would keep it open), and ends it by closing that pipe: when the client ends, by whatever
-signal, or at SIGTERM. Killed itself, its pipe closes all the same. On ``READY_FD`` it writes one
-JSON document, what the container announced or how the engine's command ended. At the end it
-removes the container, if it is still there, and ``FOLDER``.
+The monitor starts the engine's attached ``run`` with a pipe as stdin. Only the monitor holds the
+pipe's other end, because a fork of the client would keep it open. The monitor closes the pipe, and
+so ends the container, at SIGTERM and whenever the client ends; the kernel closes it if the monitor
+is killed. The monitor writes one JSON document to ``READY_FD``: the container's announcement, or
+the end of the engine's command. Last it removes the container, if it is left, and ``FOLDER``.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _REMOVE_S = 30.0
 
 
 def main(argv: Sequence[str]) -> int:
-    """Keep a container until its client ends."""
+    """Run a container until its client ends."""
     client, ready = int(argv[0]), int(argv[1])
     folder, name, command = argv[2], argv[3], list(argv[5:])
     woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -40,7 +40,7 @@ def main(argv: Sequence[str]) -> int:
         return ContainerMonitor(client, ready, woken, command).run()
     finally:
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-            # usually gone by now; an engine that was restarted meanwhile may have kept it
+            # --rm has usually removed it by now; an engine that was restarted may have kept it
             _quietly([command[0], "rm", "--force", "--volumes", name], _REMOVE_S)
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -51,7 +51,7 @@ def _quietly(command: list[str], timeout_s: float) -> None:
 
 
 class ContainerMonitor:
-    """The loop: the client's life, the container's output, and its end."""
+    """The loop: waits for the client's end, and reads the container's output until its end."""
 
     def __init__(self, client: int, ready: int, woken: int, command: list[str]) -> None:
         self._client, self._ready, self._woken = client, ready, woken
@@ -64,7 +64,7 @@ class ContainerMonitor:
         self._output = self._process.stdout.fileno()
 
     def run(self) -> int:
-        """Until the client or the container ends; the engine's exit code."""
+        """Run until the client or the container ends; returns the engine's exit code."""
         poller = select.poll()
         for fd in (self._client, self._woken, self._output):
             poller.register(fd, select.POLLIN)
@@ -94,7 +94,7 @@ class ContainerMonitor:
 
     def _tell(self, document: bytes) -> None:
         if self._ready >= 0:
-            with contextlib.suppress(OSError):  # the client waits no more
+            with contextlib.suppress(OSError):  # the client has stopped waiting
                 os.write(self._ready, document[:_LINE_BYTES] + b"\n")
             os.close(self._ready)
             self._ready = -1
@@ -109,7 +109,7 @@ class ContainerMonitor:
         return code
 
     def _wait(self) -> int:
-        """The server ends at the end of its stdin; what it still says must be read, or it waits."""
+        """Wait for the server, which ends when its stdin does; unread output would block it."""
         try:
             rest, _ = self._process.communicate(timeout=_END_S)
             self._tail = (self._tail + rest)[-_TAIL_BYTES:]
@@ -120,4 +120,4 @@ class ContainerMonitor:
 
 if __name__ == "__main__":
     ended = main(sys.argv[1:]) if len(sys.argv) > 6 else 2
-    sys.exit(ended if ended >= 0 else 125)  # of the engine's command itself: as engines say it
+    sys.exit(ended if ended >= 0 else 125)  # a signal ended it: an engine's failure

@@ -1,11 +1,11 @@
-"""A repository's packages for a container: made here and mounted there, or in an image of its own.
+"""A repository's packages for a container: in a folder that is mounted, or in a derived image.
 
-The folder is the one that a jail of this machine would be shown. So an interpreter of this machine
-has to be of the kind of the image's, and no wheel may need a newer glibc than the image has.
+The folder is made on this machine, as for a jail on it. So the image's interpreter must match an
+interpreter of this machine, and the image's glibc may not be older than this machine's.
 
-In a derived image the server's interpreter stays as it is. The repository's packages go into
-``/opt/environment``, where the worker looks for the interpreter of its jails, and whatever would
-run at the start of every interpreter is left out of it.
+A derived image keeps the server's interpreter unchanged. The repository's packages are in
+``/opt/environment``, where the worker looks for the interpreter of its jails, without the files
+that every interpreter would run at its start.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target, reso
 from envhub_sandbox.settings.options import option_name
 
 _INTERPRETER = "/opt/envhub-worker/bin/python"
-"""The server's, in every image."""
-# without site, so that nothing of what is installed there runs: its metadata is read
+"""The server's interpreter in every image."""
+# Runs without site, so that no installed package runs: the program only reads their metadata.
 _ASK = """
 import glob, json, os, platform, sys
 from importlib import metadata
@@ -64,7 +64,7 @@ print(json.dumps([*facts, platform.libc_ver()[1], there]))
 
 
 class ImageTarget:
-    """The Python of an image. ``engine``: gives the engine, once there is something to ask it."""
+    """Packages for the Python of an image. ``engine``: finds the engine when it is first needed."""
 
     def __init__(self, engine: Callable[[], Engine], image: str) -> None:
         self._engine = engine
@@ -75,16 +75,16 @@ class ImageTarget:
         return image_packages(engine, find_image(engine, self._image))
 
     def meets(self, request: PackageRequest) -> bool:
-        """Whether the image has all of it; raises as ``image_packages``."""
+        """Whether the image has all requested packages; raises as ``image_packages``."""
         interpreter, installed = self._inside()
         names = set(map(canonicalize_name, installed))
         brings_all = all(guess.is_among(names) for guess in request.guesses)
         return brings_all and first_unmet(request, installed, interpreter.version) is None
 
     def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
-        """An environment of this machine, to be mounted; its interpreter is the image's.
-        Raises ``DependencyError``: it cannot be made, or not for that image;
-        ``SandboxUnavailableError``: it is no image of ours.
+        """Make a folder of packages on this machine, to mount for the image's interpreter.
+        Raises ``DependencyError``: it cannot be made, or the image cannot use it;
+        ``SandboxUnavailableError``: this is not an image of envhub-worker.
         """
         ours = interpreter_fitting(self._inside()[0], request)
         packages = HERE.make(replace(request, python=ours.path), tell)
@@ -93,8 +93,8 @@ class ImageTarget:
 
 @lru_cache(maxsize=16)
 def image_packages(engine: Engine, image: str) -> tuple[Interpreter, dict[str, InstalledPackage]]:
-    """The interpreter of an image, and what is installed for its jails; by the image's id.
-    Raises ``SandboxUnavailableError``: it is none of ours.
+    """Return an image's interpreter and the packages for its jails. ``image``: its id or name.
+    Raises ``SandboxUnavailableError``: this is not an image of envhub-worker.
     """
     try:
         answer = engine.run(
@@ -117,7 +117,7 @@ def image_packages(engine: Engine, image: str) -> tuple[Interpreter, dict[str, I
 
 
 def interpreter_fitting(theirs: Interpreter, request: PackageRequest) -> Interpreter:
-    """An interpreter of this machine whose packages the image's can import.
+    """Find an interpreter of this machine whose packages the image's interpreter can import.
     Raises ``DependencyError``: there is none.
     """
     versions_asked = SpecifierSet(request.supports)
@@ -166,7 +166,7 @@ def _remedy() -> str:
 LOCK_LABEL = "dev.envhub.lock"
 _PACKAGE = re.compile(r"[a-z0-9][a-z0-9.+-]+")
 
-# An interpreter runs these at its start, before anything could confine it.
+# An interpreter runs these files at its start, before the worker confines it.
 _STARTERS = "-name '*.pth' -o -name 'sitecustomize*' -o -name 'usercustomize*'"
 _TEMPLATE = """\
 FROM {base}
@@ -183,22 +183,22 @@ USER 65532:65532
 
 
 def target_of(engine: Engine, image: str) -> Target:
-    """What runs in a worker's image; raises as ``image_packages``."""
+    """Return the Python version and the machine of an image; raises as ``image_packages``."""
     interpreter, _ = image_packages(engine, image)
     return Target(version=".".join(interpreter.version.split(".")[:2]), machine=interpreter.machine)
 
 
 def tag_for(repository: str, base: str, lock: Lock, system: Sequence[str]) -> str:
-    """The derived image's name: the repository's, and the hash of all that it is made of."""
+    """Return the derived image's tag: the repository's name, and the hash of all inputs."""
     slug = re.sub(r"[^a-z0-9]+", "-", repository.lower()).strip("-")[-60:] or "local"
     made_of = "\n".join([base, lock.text, _TEMPLATE, *system])
     return f"envhub-worker-{slug}:{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
 
 
 def dockerfile(base: str, lock: Lock, system: Sequence[str]) -> str:
-    """The derived image's recipe.
-    ``system``: Debian packages, for the libraries that some wheels need.
-    Raises ``DependencyError``: one of these is no name of a package.
+    """Return the derived image's Dockerfile.
+    ``system``: names of Debian packages, for the libraries that some wheels need.
+    Raises ``DependencyError``: a name is invalid.
     """
     for name in system:
         if not _PACKAGE.fullmatch(name):
@@ -215,8 +215,8 @@ def dockerfile(base: str, lock: Lock, system: Sequence[str]) -> str:
 
 
 class DerivedImage(NamedTuple):
-    """An image with a repository's packages: its name, whether it was made just now, its packages,
-    and the modules for which some were taken that nothing declares.
+    """An image with a repository's packages: its tag, whether it was just built, the packages, and
+    the imported modules for which undeclared packages were chosen.
     """
 
     tag: str
@@ -235,15 +235,15 @@ def derived(
     network: str | None = None,
     tell: Callable[[str], None] = lambda line: None,
 ) -> DerivedImage:
-    """The image for what a repository is to have, built unless the engine has it.
+    """Derive the image with the requested packages; builds it unless the engine has it.
 
     Args:
-        name: The repository's, for people.
-        system: Debian packages that it needs, too.
-        network: That of the build, as engines call it.
+        name: The repository's name, for the image's tag.
+        system: Debian packages to install, too.
+        network: The engine's name of the network for the build.
 
-    Raises ``DependencyError``: it cannot be made; the text says what to change;
-    ``SandboxUnavailableError``: the base is no image of ours, or is not there.
+    Raises ``DependencyError``: the image cannot be built; the text says what to change;
+    ``SandboxUnavailableError``: the base is not an image of envhub-worker, or does not exist.
     """
     identity, target = find_image(engine, base), target_of(engine, base)
     _check_python(request, target)
@@ -268,14 +268,14 @@ def _check_python(request: PackageRequest, target: Target) -> None:
 
 
 class BuiltImageTarget(ImageTarget):
-    """The Python of an image, from which one with the packages is derived."""
+    """Packages for the Python of an image, in an image that is derived from it."""
 
     def __init__(self, engine: Callable[[], Engine], image: str, network: str | None) -> None:
         super().__init__(engine, image)
         self._network = network
 
     def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
-        """An image, whose name stands for its packages; raises as ``derived``."""
+        """Derive an image, whose tag names its packages; raises as ``derived``."""
         engine = self._engine()
         packages = derived(engine, self._image, request, network=self._network, tell=tell)
         facts = {"lock": f"sha256:{packages.lock.digest}", "packages": packages.lock.packages}
@@ -284,7 +284,7 @@ class BuiltImageTarget(ImageTarget):
 
 
 def build(engine: Engine, recipe: str, lock: Lock, tag: str, network: str | None) -> None:
-    """Build the image; what the engine says goes to stderr. Raises ``DependencyError``."""
+    """Build the image. Raises ``DependencyError``: the engine failed; the text has its output."""
     with tempfile.TemporaryDirectory(prefix="envhub-image-") as folder:
         (Path(folder) / "Dockerfile").write_bytes(recipe.encode())
         (Path(folder) / "requirements.lock").write_bytes(lock.text.encode())

@@ -1,11 +1,11 @@
-"""What starts a container: the command line of what is wanted, and the system call profile. Pure.
+"""Builds the command line that starts a container, and its system call profile. Pure.
 
-The profile starts from the idea of the engines' default one, an allow-list that denies whatever
-reaches the kernel's innards, and differs in two ways. It permits what the worker needs to lock its
-jails down (Landlock, filters of their own, namespaces and mounts inside of a user namespace), which
-the default either denies or has not heard of. And it denies what neither the worker nor a jail ever
-calls, though the default permits it: tracing, reading other processes' memory, other address
-families, the other word size. A jail's own filter, which the worker installs, lies within.
+The profile is an allow-list, like the engines' default, which denies calls that reach the kernel's
+internals. It differs in two ways. It permits the calls by which the worker locks down jails:
+Landlock, their own filters, namespaces, and mounts inside a user namespace. The default denies or
+does not know these. And it denies calls that the default permits, but neither the worker nor a jail
+needs: tracing, reading other processes' memory, other address families, the other word size. The
+worker adds a filter for each jail.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy
 
 CLIENT_LABEL = "dev.envhub.client"
-"""The client's pid, in its own namespace: for people."""
+"""The client's pid in the client's own pid namespace, for people to read."""
 FOLDER_LABEL = "dev.envhub.folder"
-"""The runtime folder of the client, which is in use as long as the client lives."""
+"""The client's runtime folder, which is in use as long as the client lives."""
 USER_LABEL = "dev.envhub.user"
 """The user id of the client."""
 
 SOCKETS = "/run/envhub"
-"""The only channel: a folder of mode 0700 that client and server share."""
+"""The folder of mode 0700 that client and server share: their only channel."""
 SNAPSHOTS = "/snapshots"
 SNAPSHOT = f"{SNAPSHOTS}/this"
-"""Where the repository's files lie inside: their path outside stays unknown there."""
+"""The folder of the repository's files in the container, which does not learn the host's path."""
 PACKAGES = "/packages"
-"""Where packages lie inside that were made for the repository."""
+"""The folder in the container of the packages that were made for the repository."""
 PORT = 5555
-"""Where a server listens inside whose port is published."""
+"""The port in the container of a server whose port is published."""
 IMAGE_USER = 65532
 """The image's own user, who owns ``STATE``."""
 STATE = "/var/lib/envhub-worker"
-"""Where such a server keeps what it is sent."""
+"""The folder in the container where a server with a published port stores uploads."""
 
 _MIB = 1024 * 1024
 _OVERHEAD_BYTES = 1024 * _MIB
 _OVERHEAD_PIDS = 256
 _SHARED_MEMORY_BYTES = 1024 * _MIB
-# What a container has of its own. A path of the host over one of these would replace it.
+# The container's own top-level folders. A path of the host mounted on one would replace it.
 _OWN = frozenset(
     {
         *("bin", "dev", "etc", "lib", "lib32", "lib64", "libx32", "opt", "packages", "proc"),
@@ -57,27 +57,27 @@ _OWN = frozenset(
 
 @dataclass(frozen=True, kw_only=True)
 class Container:
-    """One container, as it is wanted.
+    """The requested properties of a container.
 
     Attributes:
         image: The image's id.
         sockets: The host's folder that is mounted at ``SOCKETS``.
         snapshot: The host's folder that is mounted at ``SNAPSHOT``, read-only.
         packages: The host's folder that is mounted at ``PACKAGES``, read-only, or empty.
-        assets: The host's folders of further repositories, mounted read-only beside it.
-        readable: Further paths of the host, read-only, at the same place.
+        assets: The host's folders of further repositories, mounted read-only beside ``SNAPSHOT``.
+        readable: Further paths of the host, mounted read-only at the same paths.
         seccomp: The host's path of the system call profile.
         network: ``"none"`` or ``"host"``.
-        memory: Bytes, or None where the engine cannot limit it; swap is not added.
-        pids: Processes and threads, or None likewise.
-        cpus: Processors' worth of time, or None likewise.
+        memory: The limit in bytes without swap, or None if the engine cannot set it.
+        pids: The limit of processes and threads, or None if the engine cannot set it.
+        cpus: The limit of CPUs, or None if the engine cannot set it.
         scratch: Bytes of /tmp.
         runtime: The engine's runtime, or None for its default.
-        gpus: What ``--gpus`` takes, or None.
-        ulimits: What ``--ulimit`` takes, besides that no core is dumped.
-        only_client: The public key of the client, as text, where it comes over a port that is
-            published on loopback; then nothing of the host is mounted, and the first two are empty.
-        profile: The weakest one that such a server permits.
+        gpus: The value of ``--gpus``, or None.
+        ulimits: The values of ``--ulimit``, besides the one that forbids core dumps.
+        only_client: The client's public key, as text, if the server's port is published on
+            loopback. Then no file of the host is mounted; ``sockets`` and ``snapshot`` are empty.
+        profile: The weakest profile that a server with a published port permits.
     """
 
     name: str
@@ -103,7 +103,7 @@ class Container:
 
 
 def run_arguments(engine: Engine, wanted: Container) -> list[str]:
-    """What follows the engine's name on the command line."""
+    """Return the arguments of the engine's command."""
     return [
         *("run", "--rm", "--interactive", "--pull", "never", "--log-driver", "none"),
         *("--no-healthcheck", "--name", wanted.name, "--hostname", "sandbox", "--workdir", "/"),
@@ -130,7 +130,7 @@ def _listen(wanted: Container) -> list[str]:
     return [
         *("listen", "--bind", f"tcp://0.0.0.0:{PORT}", "--only-client", wanted.only_client),
         *("--log-level", "warning"),
-        # as it is by default where there is Landlock; the caller may choose it where there is none
+        # "strict" is the default; without Landlock the caller may choose a weaker profile
         *(["--weakest-profile", wanted.profile] if wanted.profile != "strict" else []),
         *(["--allow-network"] if wanted.network == "host" else []),
         *(["--allow-gpu"] if wanted.gpus is not None else []),
@@ -140,8 +140,8 @@ def _listen(wanted: Container) -> list[str]:
 def _confinement(engine: Engine, wanted: Container) -> list[str]:
     user, group = wanted.user
     podman = engine.kind == "podman"
-    # /proc as it is: a jail can mount one of its own only where an unmasked one is in sight. What
-    # the masks would hide is root's, whom no process in there can become, and jails see none of it.
+    # The kernel lets a jail mount its own /proc only if an unmasked one is visible. The masks would
+    # hide files of root, which no process in here can become; jails see none of them.
     unmasked = "unmask=ALL" if podman else "systempaths=unconfined"
     words = ["--network", wanted.network, "--read-only", "--cap-drop", "ALL"]
     if wanted.only_client:  # a port needs a network
@@ -175,7 +175,7 @@ def _files(wanted: Container) -> list[str]:
     scratch = f"rw,nosuid,nodev,size={wanted.scratch},mode=1777"
     own = ["--tmpfs", f"/tmp:{scratch}", "--shm-size", str(_SHARED_MEMORY_BYTES)]
     if wanted.only_client:
-        return [*own, "--mount", f"type=volume,dst={STATE}"]  # without a name: it goes, too
+        return [*own, "--mount", f"type=volume,dst={STATE}"]  # unnamed: --rm removes it
     mounts = [
         _mount(wanted.sockets, SOCKETS, read_only=False),
         _mount(wanted.snapshot, SNAPSHOT, read_only=True),
@@ -187,12 +187,12 @@ def _files(wanted: Container) -> list[str]:
 
 
 def asset_places(assets: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Each asset's folder on the host, and where it lies inside."""
+    """Return each asset's folder on the host, and its folder in the container."""
     return ((path, f"{SNAPSHOTS}/asset-{number}") for number, path in enumerate(assets))
 
 
 def _mount(source: str, target: str, *, read_only: bool) -> str:
-    # one value of a line of CSV each, so that a comma or a quote in a path is no separator
+    # quote each value as in CSV, so that a comma or a quote in a path separates nothing
     values = ["type=bind", f"src={source}", f"dst={target}", *(["readonly"] if read_only else [])]
     quoted = ['"' + value.replace('"', '""') + '"' for value in values]
     return ",".join(quoted)
@@ -207,22 +207,22 @@ def _devices(engine: Engine, wanted: Container) -> list[str]:
 
 
 def memory_for(policy: Policy) -> int:
-    """Bytes for one jail at its limit, and for the server."""
+    """Return the bytes for one jail at its limit and for the server."""
     return policy.limits.memory_bytes + _OVERHEAD_BYTES
 
 
 def pids_for(policy: Policy) -> int:
-    """Processes for one jail at its limit, and for the server."""
+    """Return the number of processes for one jail at its limit and for the server."""
     return policy.limits.processes + _OVERHEAD_PIDS
 
 
 def scratch_for(policy: Policy) -> int:
-    """Bytes of /tmp: a jail's scratch lies there where it has no file system of its own."""
+    """Return the bytes of /tmp, which has the scratch of a jail without its own file system."""
     return policy.limits.disk_bytes + 64 * _MIB
 
 
 def check_readable(paths: tuple[str, ...]) -> None:
-    """Refuse what would replace the container's own files. Raises ``PolicyError``."""
+    """Raise ``PolicyError`` if a path would replace the container's own files."""
     for path in paths:
         parts = [part for part in path.split("/") if part]
         if ".." in parts or not parts or (len(parts) == 1 and parts[0] in _OWN):
@@ -232,10 +232,10 @@ def check_readable(paths: tuple[str, ...]) -> None:
             )
 
 
-#: What ``os.uname`` calls a machine, and what a profile calls it.
+#: For each machine name of ``os.uname`` the name in a profile.
 ARCHITECTURES = {"x86_64": "SCMP_ARCH_X86_64", "aarch64": "SCMP_ARCH_AARCH64"}
 _OTHER_NAMES = {"amd64": "x86_64", "arm64": "aarch64"}
-"""As engines have them."""
+"""For each of the engines' machine names the name of ``os.uname``."""
 
 _MEMORY = """
     brk get_mempolicy madvise mbind membarrier memfd_create mincore mlock mlock2 mlockall mmap
@@ -282,7 +282,7 @@ _SYSTEM_V = """
     mq_getsetattr mq_notify mq_open mq_timedreceive mq_timedsend mq_unlink msgctl msgget msgrcv
     msgsnd semctl semget semop semtimedop shmat shmctl shmdt shmget
 """
-# What locks a jail down. Outside of a user namespace these need capabilities, which none here has.
+# Calls that lock down a jail. Outside a user namespace most need capabilities, which are dropped.
 _LOCKDOWN = """
     landlock_add_rule landlock_create_ruleset landlock_restrict_self mount mount_setattr move_mount
     open_tree pivot_root seccomp sethostname setns umount2 unshare
@@ -290,15 +290,15 @@ _LOCKDOWN = """
 ALLOWED = frozenset(
     " ".join((_MEMORY, _FILES, _PROCESSES, _SIGNALS, _SOCKETS, _SYSTEM_V, _LOCKDOWN)).split()
 )
-"""Calls that are permitted whatever their arguments."""
+"""Calls that are permitted with any arguments."""
 
 FAMILIES = {"AF_UNIX": 1, "AF_INET": 2, "AF_INET6": 10, "AF_NETLINK": 16}
 _PERSONALITIES = (0, 0xFFFFFFFF)
 
 
 def seccomp_profile(machine: str | None = None) -> dict[str, Any]:
-    """The profile, in the form that docker and podman read. ``machine``: as ``os.uname`` says it;
-    default: this one.
+    """Return the profile in the form that docker and podman read.
+    ``machine``: its name as in ``os.uname``; by default this machine.
     Raises ``SandboxUnavailableError``: there is no profile for the machine.
     """
     machine = machine or platform.machine()
@@ -310,13 +310,13 @@ def seccomp_profile(machine: str | None = None) -> dict[str, Any]:
     return {
         "defaultAction": "SCMP_ACT_ERRNO",
         "defaultErrnoRet": errno.EPERM,
-        # only the native one: the calls of another word size are ways around every filter
+        # only the native word size: calls of another one would bypass the filter
         "architectures": [ARCHITECTURES[machine]],
         "syscalls": [
             {"names": sorted(ALLOWED), "action": "SCMP_ACT_ALLOW"},
             *(_only(("socket", "socketpair"), family) for family in FAMILIES.values()),
             *(_only(("personality",), value) for value in _PERSONALITIES),
-            # its flags lie in memory, where no filter can look; the C library falls back to clone
+            # no filter can read clone3's flags in memory; the C library falls back to clone
             {"names": ["clone3"], "action": "SCMP_ACT_ERRNO", "errnoRet": errno.ENOSYS},
         ],
     }

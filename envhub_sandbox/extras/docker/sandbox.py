@@ -1,10 +1,10 @@
 """``sandbox="docker"``: the worker in a container of its own for each repository.
 
-The container has no network, a read-only root, no capability, limits, and three things from
-outside: the repository's files, scratch in memory, and a folder of mode 0700 with two sockets,
-over which messages and the fast lane's descriptors travel. Inside, the worker locks each jail
-down as it does on a host. What holds is read from inside before anything runs; see
-``docs/deployment.md``. Where the engine runs in a virtual machine, see ``published.py``.
+The container has no network, a read-only root, no capabilities, and limits. Its mounts are the
+repository's files and packages, scratch in memory, and a folder of mode 0700 with two sockets,
+which carry messages and the fast lane's descriptors. Inside, the worker locks down each jail as on
+a host. The server reports its confinement, and the client checks it before any jail runs; see
+``docs/deployment.md``. ``published.py`` is for an engine in a virtual machine.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ class DockerSandbox(ContainerOptions, Sandbox):
     """Workers in containers. ``sandbox="docker"`` is this with its defaults.
 
     Attributes:
-        image: The image: ``docker build -t envhub-worker .``, or one that is derived from it.
+        image: The image of ``docker build -t envhub-worker .``, or one derived from it.
         engine: ``"docker"`` or ``"podman"``; by default docker, if it answers, else podman.
         runtime: The engine's runtime, such as ``"runsc"``.
-        gpus: What ``--gpus`` takes; ``"all"`` where the policy grants the GPU.
+        gpus: The value of ``--gpus``; by default ``"all"`` if the policy grants the GPU.
         memory: Bytes for all jails of a repository and the server; by default the policy's limit
-            and 1 GiB.
-        pids: Processes and threads likewise; by default the policy's limit and 256.
-        cpus: Processors' worth of time; by default as many as this process may use.
-        cgroups: False goes without these three, where an engine cannot limit them.
+            plus 1 GiB.
+        pids: Processes and threads of the same; by default the policy's limit plus 256.
+        cpus: The number of CPUs, fractions included; by default those that this process may use.
+        cgroups: False sets none of these three limits, for an engine that cannot.
         published: Publish a port on loopback, and mount no file of this machine: for an engine in a
             virtual machine. True by default on macOS and Windows.
         build_network: With ``published``, the engine's name of the network for building images with
@@ -59,8 +59,8 @@ class DockerSandbox(ContainerOptions, Sandbox):
     def for_repository(
         self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
     ) -> RepositoryContainer:
-        """The container for one repository. Starts nothing, but asks for engine and image.
-        Raises ``PolicyError``: a container cannot give what the policy permits;
+        """Return the container for one repository; starts none, but looks for engine and image.
+        Raises ``PolicyError``: a container cannot provide something that the policy grants;
         ``SandboxUnavailableError``: there is no engine, no image, or no permission.
         """
         if runtime.python:
@@ -99,12 +99,12 @@ class DockerSandbox(ContainerOptions, Sandbox):
                 "is needed into the repository"
             )
         engine = find_engine(self.engine)
-        # what was made for the repository is an image
+        # the packages that were made for the repository are an image
         image = find_image(engine, runtime.packages or self.image)
         return PublishedContainer(self, engine, image, snapshot, policy, assets=assets)
 
     def package_target(self) -> ImageTarget:
-        """Packages are made for the image's Python: on this machine, or else as an image."""
+        """See ``Sandbox``: packages for the image's Python, on this machine or in an image."""
         engine = partial(find_engine, self.engine)
         if self.published:
             return BuiltImageTarget(engine, self.image, self.build_network)

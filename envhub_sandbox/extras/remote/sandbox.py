@@ -255,7 +255,7 @@ class RemoteServer(WorkerServer):
         return True
 
     def stop(self) -> None:
-        """See ``WorkerServer``: close the open jails, and end the thread of keep-alives."""
+        """See ``WorkerServer``: close the open jails, and end the keep-alive thread."""
         if self._ended or not self._owner.is_here:
             return
         self._close_jails()
