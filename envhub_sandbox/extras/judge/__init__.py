@@ -1,1 +1,1 @@
-"""Judges a repository before it is trusted: what ``envhub check`` asks, and how it says it."""
+"""Judges a repository before it is trusted: the checks of ``envhub check`` and their reports."""

@@ -1,8 +1,8 @@
-"""What is different between two commits, in terms of what a repository would do.
+"""Lists the differences between two commits, in terms of a repository's behaviour.
 
-A finding is the same where it stands in the same file, in a line that reads the same: lines that
-move are no change, and what stands in a changed line is a new finding. So is what is about a whole
-file that was changed: a pickle, an archive, or source of which not all was read.
+Two findings are the same if they are in the same file, in lines with the same text: moved lines are
+no change, and a finding in a changed line is new. A finding about a whole file, such as a pickle,
+an archive or partly read source, is new if the file has changed.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ _AROUND, _COMPARED, _MOST_LINES, _WIDEST = 2, 500, 60, 200
 
 @dataclass(frozen=True)
 class Change:
-    """One thing that differs.
+    """One difference.
 
     Attributes:
         what: ``"file"``, ``"entry"``, ``"python"``, ``"package"``, ``"import"``, ``"finding"`` or
             ``"environment"``.
         how: ``"new"``, ``"gone"``, ``"changed"`` or ``"renamed"``.
-        lines: Of a changed file of text: as ``diff -u`` has them, escaped and bounded.
+        lines: The diff of a text file, in the form of ``diff -u``, escaped and bounded.
     """
 
     what: str
@@ -49,7 +49,7 @@ class Change:
     lines: tuple[str, ...] = ()
 
     def weighs(self, least: Severity) -> bool:
-        """Whether it is a new finding of at least this severity."""
+        """Tells whether this is a new finding of at least this severity."""
         return (
             self.finding is not None
             and self.how == "new"
@@ -58,7 +58,7 @@ class Change:
 
 
 def changes(then: Static, now: Static) -> list[Change]:
-    """What differs, in the order of ``Change.what``."""
+    """Lists all differences, in the order of ``Change.what``."""
     other = _other(then, now)
     return [
         *_files(then, now, other),
@@ -79,7 +79,7 @@ def _records(read: Static) -> dict[str, FileRecord]:
 
 
 def _other(then: Static, now: Static) -> set[str]:
-    """The files of both that have other bytes."""
+    """Returns the files in both commits whose bytes differ."""
     before, after = _records(then), _records(now)
     return set(differing(now.snapshot.root, after.values(), before.values())) & set(before)
 
@@ -101,9 +101,9 @@ def _files(then: Static, now: Static, other: Collection[str]) -> Iterator[Change
 
 
 def _changed_lines(then: Path, now: Path) -> tuple[str, ...]:
-    """How a file's lines differ, as ``diff -u`` shows it; nothing for a file that is no text.
+    """Returns the changed lines of a text file, as ``diff -u`` shows them; empty for binary files.
 
-    Few lines are compared, so that no stranger's file can take long.
+    Compares only a bounded number of lines, so that a stranger's file cannot take long.
     """
     try:
         before, after = map(_lines, (then, now))
@@ -125,8 +125,8 @@ def _changed_lines(then: Path, now: Path) -> tuple[str, ...]:
 
 
 def _lines(path: Path) -> list[str]:
-    """Only a line feed ends one. ``splitlines`` would take a form feed, which is a blank to Python,
-    for the line feed that makes code of the rest of a comment.
+    """Splits a text at line feeds only. ``splitlines`` also splits at a form feed, which is a blank
+    to Python: the rest of a comment would then look like a line of code.
     """
     text = codecs.getincrementaldecoder("utf-8")().decode(bytes_of(path, _MOST_BYTES))
     return text.removesuffix("\n").split("\n") if text else []
@@ -187,9 +187,9 @@ def _findings(then: Static, now: Static, other: Collection[str]) -> Iterator[Cha
 
 
 def _by_line(read: Static, other: Collection[str]) -> dict[tuple[str, ...], list[Finding]]:
-    """Findings by what they say and by the line that they stand in, whatever its number; or by the
-    bytes of their file, where that has ``other`` ones and no line is named, or none can be found:
-    findings have the names of files as far as they are printed.
+    """Groups findings by their message and by the text of their line, whatever its number. For a
+    finding without a line, or in a file that is not in the list, the hash of the file replaces the
+    line if the file is in ``other``. Findings hold file names in printable form.
     """
     lines: dict[str, list[str]] = {}
     findings: dict[tuple[str, ...], list[Finding]] = {}
@@ -210,13 +210,13 @@ def _by_line(read: Static, other: Collection[str]) -> dict[tuple[str, ...], list
 
 
 def environments(then: Sequence[TaskFingerprint], now: Sequence[TaskFingerprint]) -> list[Change]:
-    """What differs in what two of them return. Trust: input from the worker, already checked."""
+    """Compares the environments of two commits. Trust: input from the worker, already checked."""
     lines = (line.removeprefix("environment ") for line in drift_of_tasks(then, now))
     return [Change("environment", "changed", _shown(line)) for line in lines]
 
 
 def document(then: Static, now: Static, found: list[Change]) -> dict[str, Any]:
-    """All of it, as plain data."""
+    """Returns all differences as plain data."""
     return {
         "then": then.reference,
         "now": now.reference,

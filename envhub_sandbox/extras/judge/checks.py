@@ -1,4 +1,4 @@
-"""The table of checks: what each means, and how to fix what it finds.
+"""The table of checks: the meaning of each check, and the cure for its findings.
 
 The checks, their reports and ``docs/checks.md`` use this table.
 """
@@ -12,7 +12,7 @@ from enum import Enum
 
 
 class Severity(str, Enum):
-    """How severe a finding is, worst first; the words are SARIF's."""
+    """The severity of a finding, worst first, in SARIF's words."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -20,11 +20,11 @@ class Severity(str, Enum):
 
     @property
     def rank(self) -> int:
-        """Its place among the others, 0 for the worst."""
+        """Returns the position in the order, 0 for the worst."""
         return list(Severity).index(self)
 
     def reaches(self, other: Severity) -> bool:
-        """Whether it is at least as severe."""
+        """Tells whether this severity is at least as severe as another."""
         return self.rank <= other.rank
 
 
@@ -34,8 +34,8 @@ class Check:
 
     Attributes:
         id: Its name, in reports and for ``--allow``.
-        sentence: What is true if it passes.
-        cure: What an author changes if it does not.
+        sentence: A statement that is true if the check passes.
+        cure: The change that an author makes if the check fails.
     """
 
     severity: Severity
@@ -242,7 +242,7 @@ note source-unread
 
 
 def _checks() -> Iterator[Check]:
-    """Those of the table: a line for severity and id, and below it what the check says."""
+    """Parses the table: a line with severity and id, and below it the sentence and the cure."""
     for entry in re.split(r"\n(?=\w)", _TABLE.rstrip())[1:]:
         severity, name, text = entry.split(maxsplit=2)
         sentence, _, cure = " ".join(text.split()).partition(" Cure: ")
@@ -278,5 +278,4 @@ CURES = {
     "signal": "Find the fault in native code: faulthandler.enable() prints its place.",
     "exit": "Raise an exception instead of ending the process.",
 }
-"""How to fix a finding, by the class of its error or the end of its process, if that is more
-specific than its check."""
+"""More specific cures than the check's, by the class of an error or by the end of a process."""

@@ -1,8 +1,8 @@
-"""What the contents of a repository's files are, and what in Python's source is worth a look.
+"""Classifies a repository's files, and finds suspicious contents in Python source.
 
-Their beginnings and their names decide whether they are text, Python, machine code, pickles or
-archives; nothing is opened in any other sense. Reading is bounded by file and in all. Of source
-this finds what is written plainly, by people who hide nothing: only the jail protects.
+The name and the first and last bytes decide whether a file is text, Python, machine code, a pickle
+or an archive; no file is opened by its format. Reads are bounded per file and in all. The search in
+source finds only what an author writes plainly: the jail protects from the rest.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from envhub_sandbox.extras.judge.findings import Finding
 from envhub_sandbox.extras.sources.parsing import ImportStatement, ParsedFile
 
 BEGINNING = 8192
-"""Bytes that decide what kind a file is."""
+"""First bytes, which decide the kind of a file."""
 ENDING = (1 << 16) + 22
-"""Bytes in which a zip archive's end is looked for, whatever stands before it; so Python does."""
+"""Last bytes, which Python searches for the end of a zip archive, whatever precedes it."""
 LARGE = 10 << 20
 _MACHINE_CODE = (
     *(b"\x7fELF", b"MZ", b"!<arch>\n", b"\0asm", b"\xca\xfe\xba\xbe"),
@@ -43,7 +43,7 @@ _SUFFIXES = {
 }
 _PICKLE = re.compile(rb"\x80[\x02-\x05][\x95c}\](K\x8c]")
 _NO_ARCHIVES = (".npz", ".keras")
-"""Archives by their first bytes, which hold arrays."""
+"""Files that hold arrays, though their first bytes are those of archives."""
 _SAID = {
     "machine code": ("source-native", "a file of machine code"),
     "compiled Python": ("source-compiled", "compiled Python"),
@@ -63,15 +63,15 @@ _HIDDEN_IN_CODE = re.compile(
     rf"{_HIDDEN.pattern}|[A-Za-z][{_OTHERS}]\w{{0,40}}|[{_OTHERS}][A-Za-z]\w{{0,40}}"
 )
 _MOST_HIDDEN = 20
-"""Of one file."""
+"""Hidden characters to report for one file."""
 
 
 def kind_of_contents(name: str, beginning: bytes, ending: bytes = b"") -> str:
-    """In a word or two: ``"Python"``, ``"text"``, ``"binary"``, or what is worth a look."""
+    """Names a kind in few words: ``"Python"``, ``"text"``, ``"binary"``, or a suspicious kind."""
     suffix = Path(name).suffix.lower()
     if beginning.lstrip().startswith(_LFS):
         return "LFS pointer"
-    if suffix in _SUFFIXES:  # before what it begins with: "MZ = 1" is Python
+    if suffix in _SUFFIXES:  # before the first bytes: "MZ = 1" is Python
         return _SUFFIXES[suffix]
     if beginning.startswith(_MACHINE_CODE):
         return "machine code"
@@ -88,7 +88,7 @@ def _is_archive(beginning: bytes, ending: bytes) -> bool:
 
 
 def _may_hold_code(ending: bytes) -> bool:
-    """Whether a zip's directory names modules, or is too large to be looked at."""
+    """Tells whether a zip's directory lists modules, or is too large to search."""
     end = ending.rfind(_ZIP_END)
     begin = end - int.from_bytes(ending[end + 12 : end + 16], "little")
     return end >= 0 and (begin < 0 or re.search(rb"\.(pyc?|so)", ending[begin:end]) is not None)
@@ -104,7 +104,7 @@ def _is_text(beginning: bytes) -> bool:
 
 
 def of_kind(name: str, kind: str, *, is_folder: bool) -> Iterator[Finding]:
-    """What a kind by itself gives reason to look at, in a repository or a folder that is here."""
+    """Yields the findings of a file's kind alone, in a repository or a local folder."""
     if kind == "LFS pointer" and is_folder:
         message = "a pointer of git LFS: the file that its commit has has not been judged"
         yield Finding("source-uncommitted", message, file=name)
@@ -114,7 +114,7 @@ def of_kind(name: str, kind: str, *, is_folder: bool) -> Iterator[Finding]:
 
 
 def hidden(name: str, text: str, *, is_code: bool) -> Iterator[Finding]:
-    """Characters that are shown as nothing, as another order, or as other letters."""
+    """Finds characters that are invisible, change the order of text, or imitate other letters."""
     pattern = _HIDDEN_IN_CODE if is_code else _HIDDEN
     line, counted, seen = 1, 0, set()
     for match in pattern.finditer(text):
@@ -160,7 +160,7 @@ _MODULES = {
     **_each(_DYNAMIC, "builtins runpy zipimport imp code codeop frozen_importlib interpreters"),
     **_each(_DYNAMIC, "frozen_importlib_external xxsubinterpreters"),
 }
-"""By their first names; a private one of Python's, such as ``_socket``, is its public twin."""
+"""Keys are first names; a private module, such as ``_socket``, counts as its public twin."""
 _NAMES = {
     **_each(_DYNAMIC, "eval exec compile __import__ builtins __loader__"),
     **_each(
@@ -207,21 +207,21 @@ _NAMES = {
     "yaml.load without a Loader": _UNPICKLING,
     **_each(_OUTSIDE, "os.path.expanduser pathlib.Path.home"),
 }
-"""As a name is, or as it ends behind another; with a dot in front, what anything may have."""
+"""Whole names, or ends of dotted names; a leading dot matches an attribute of any object."""
 _REFLECTED = {"os", "sys", "builtins", "importlib", "subprocess", "socket", "ctypes"}
-"""Modules of which a computed name may fetch what an author does not want to write down."""
+"""Modules with dangerous attributes, which an author may hide behind a computed name."""
 _LONG_LINE = re.compile(r"^[^\n]{2000,}", re.MULTILINE)
 
 
 def constructs(file: str, parsed: ParsedFile) -> Iterator[Finding]:
-    """What a file has of them, each once in a line."""
+    """Yields the suspicious constructs of a file, each once per line."""
     rows = (*_imported(parsed), *_used(parsed), *_said(parsed))
     for line, check, message in sorted(set(rows)):
         yield Finding(check, message, file=file, line=line)
 
 
 def long_lines(file: str, text: str) -> Iterator[Finding]:
-    """Lines that are too long to be read to their end: what stands there need not be seen."""
+    """Finds lines that are too long to read to the end, where code may hide."""
     for match in _LONG_LINE.finditer(text):
         line = 1 + text.count("\n", 0, match.start())
         message = f"a line of {len(match[0])} characters"
@@ -231,20 +231,20 @@ def long_lines(file: str, text: str) -> Iterator[Finding]:
 def _imported(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
     for statement in parsed.imports:
         for name in dict.fromkeys(module.partition(".")[0] for module in _absolute(statement)):
-            public = _bare(name) if name in sys.stdlib_module_names else name  # of _socket: socket
+            public = _bare(name) if name in sys.stdlib_module_names else name  # _socket: socket
             if check := _MODULES.get(public):
                 yield statement.line, check, f"imports {name}"
 
 
 def _absolute(statement: ImportStatement) -> Sequence[str]:
-    # below 0: names of modules; 0: names out of one; above: relative
+    # below 0: names of modules; 0: names from a module; above: relative
     return (
         statement.names if statement.level < 0 else () if statement.level else (statement.module,)
     )
 
 
 def _bare(name: str) -> str:
-    """A name without leading underscores: ``random._os`` is ``os``. ``__dict__`` stays as it is."""
+    """Strips leading underscores: ``random._os`` becomes ``os``. ``__dict__`` stays unchanged."""
     return name if name.startswith("__") else name.lstrip("_")
 
 
@@ -265,7 +265,7 @@ def _used(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
 
 
 def _meant(parts: list[str]) -> Iterator[tuple[str, str]]:
-    """Entries of the table that a dotted name ends in: their check, and their name there."""
+    """Yields table entries that a dotted name ends with: their check and their name there."""
     bare = [*map(_bare, parts)]
     ends = [".".join(bare[start:]) for start in range(len(parts) - 1)] or parts
     if len(parts) != 2 or parts[0] not in ("self", "cls"):

@@ -1,4 +1,4 @@
-"""``Finding`` and ``Report``: what checks found, how severe it is, and the verdict."""
+"""``Finding`` and ``Report``: the findings of checks, their severity, and the verdict."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _RETURNED = re.compile(
 )
 _LONGEST = 1_000
 _MOST = 500
-"""Findings: a repository of ten thousand files is no reason for as many lines."""
+"""Findings to keep: ten thousand files must not produce as many lines."""
 _SHOWN = 60
 _OF_EACH = 20
-"""Of one check, which are kept whatever there is of others: no flood of notes hides an error."""
+"""Findings to keep for each check beyond that: no flood of notes hides an error."""
 
 
 def _cause(error: EnvHubError) -> str:
-    """What an error is about, as ``CURES`` names it. Trust: the worker's word."""
+    """Returns the key of an error in ``CURES``. Trust: the worker's word."""
     if isinstance(error, WorkerDiedError):
         return error.reason
     if isinstance(error, WorkerTimeoutError):
@@ -41,14 +41,14 @@ def _cause(error: EnvHubError) -> str:
 
 @dataclass(frozen=True)
 class Finding:
-    """One check that does not hold.
+    """A failed check.
 
     Attributes:
-        message: What was seen, printable and of bounded length.
-        task: ``"suite / task"``; empty where it is about the whole repository.
-        file, line: Where it stands in the repository; empty and 0 where it stands nowhere.
-        cause: The class of the error that it is about, or how a process ended; may be empty. Trust:
-            the worker's word.
+        message: The observation, printable and bounded.
+        task: ``"suite / task"``; empty if the finding is about the whole repository.
+        file, line: The position in the repository; empty and 0 if there is none.
+        cause: The class of an error, or how a process ended; may be empty. Trust: the worker's
+            word.
     """
 
     id: str
@@ -60,12 +60,12 @@ class Finding:
 
     @property
     def text(self) -> str:
-        """What was seen, behind where it stands in the repository."""
+        """Returns the message after its position in the repository."""
         place = f"{self.file}:{self.line}: " if self.line else f"{self.file}: " if self.file else ""
         return f"{place}{self.message}"
 
     def document(self) -> dict[str, Any]:
-        """As plain data, but for its task."""
+        """Returns the finding as plain data, without its task."""
         return {
             "check": self.id,
             "severity": self.check.severity.value,
@@ -76,34 +76,34 @@ class Finding:
 
     @property
     def check(self) -> Check:
-        """What did not hold."""
+        """Returns the failed check."""
         return CHECKS[self.id]
 
     @property
     def cure(self) -> str:
-        """What an author changes: by the error, where that says more than the check."""
+        """Returns the change that an author makes, by the error if listed, else by the check."""
         return CURES.get(self.cause, self.check.cure)
 
 
 @dataclass
 class Report:
-    """A judgement.
+    """The result of a judgement.
 
     Attributes:
-        reference: What was judged, pinned.
-        findings: The most severe first; those of one severity as they were found.
-        passed: Checks that were made, by id and task, and found nothing.
-        figures: Of each task that was played: plain numbers.
-        provenance: What ran, if anything did.
-        left_out: How many findings are not in ``findings``.
-        asked: How it was judged, by name, in words of ours.
-        plays: What each task gave to look at.
-        commit: Of what was judged; of a folder of this machine a hash of its content.
-        confinement: What confined it; None where nothing of it ran.
-        waiting: Tasks that have not been judged to their end.
-        unmade: Checks that were not made of anything, where a deadline ended it.
-        folder: Where it lies below the current folder, which in CI is the checkout whose files are
-            annotated; ends with a slash, empty where it is that folder or lies elsewhere.
+        reference: The judged reference, pinned.
+        findings: Most severe first; in the order of discovery within a severity.
+        passed: The id and the task of each check without findings.
+        figures: Plain numbers for each task that was played.
+        provenance: A description of the code that ran, if any did.
+        left_out: The number of findings that are not in ``findings``.
+        asked: The settings of the judgement, by name, in our words.
+        plays: The data of each task's play that the page shows.
+        commit: The judged commit; for a local folder a hash of its content.
+        confinement: The sandbox's confinement; None if no code ran.
+        waiting: Tasks whose judgement is incomplete.
+        unmade: Checks that no task had when a deadline ended the judgement.
+        folder: The folder's path below the current folder, which in CI is the checkout with the
+            annotated files; ends with a slash; empty if equal or elsewhere.
     """
 
     reference: str
@@ -122,7 +122,7 @@ class Report:
     _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
     def judged(self, check: str, texts: Iterable[str], task: str = "") -> None:
-        """A check was made: it found this, or nothing. Trust: texts from the worker."""
+        """Record a check and its findings, if any. Trust: texts from the worker."""
         messages = list(texts)
         for message in messages:
             self.add(Finding(check, message, task))
@@ -130,7 +130,7 @@ class Report:
             self.passed.append((check, task))
 
     def raised(self, check: str, error: EnvHubError, task: str = "", message: str = "") -> None:
-        """A check ended in an error: what it says, and the author's line. Trust: the worker's."""
+        """Record a check that raised: text and author's line. Trust: text from the worker."""
         remote = error if isinstance(error, RemoteEnvError) else error.__cause__
         place = (remote.file, remote.line) if isinstance(remote, RemoteEnvError) else ("", 0)
         if isinstance(error, RemoteEnvError):
@@ -138,7 +138,7 @@ class Report:
         self.add(Finding(check, message or str(error), task, *place, cause=_cause(error)))
 
     def add(self, finding: Finding) -> Finding | None:
-        """Add what was found, made printable; None where there is no room for it."""
+        """Adds a finding in printable form; returns None if the report is full."""
         if len(self.findings) >= _MOST and self._kept[finding.id] >= _OF_EACH:
             self.left_out += 1
             return None
@@ -153,12 +153,12 @@ class Report:
         return kept
 
     def failures(self, fail_on: Severity, allowed: Collection[str] = ()) -> list[Finding]:
-        """The findings that weigh enough, without those that are allowed."""
+        """Returns findings of at least this severity whose checks are not allowed."""
         findings = (finding for finding in self.findings if finding.id not in allowed)
         return [finding for finding in findings if finding.check.severity.reaches(fail_on)]
 
     def stopped(self, seconds: float, at: str) -> None:
-        """A deadline of so many seconds ended it at something: what was not judged is a finding."""
+        """Record that a deadline ended the judgement: the missing checks are a finding."""
         made = {finding.id for finding in self.findings} | {check for check, _ in self.passed}
         self.unmade = [check for check in CHECKS if check not in made and check != "deadline"]
         left = [*self.unmade, *(f"all of {task}" for task in self.waiting)]
@@ -168,11 +168,11 @@ class Report:
 
     @staticmethod
     def is_unjudged(failures: Collection[Finding]) -> bool:
-        """Whether nothing fails but that there was no time to judge all of it."""
+        """Tells whether the only failure is the lack of time for the whole judgement."""
         return bool(failures) and all(finding.id == "deadline" for finding in failures)
 
     def verdict(self, failures: Collection[Finding]) -> str:
-        """What came of it, in a sentence."""
+        """Returns the verdict in a sentence."""
         held = counted(len({check for check, _ in self.passed}), "check holds", "checks hold")
         findings = counted(len(self.findings) + self.left_out, "finding")
         if not failures:

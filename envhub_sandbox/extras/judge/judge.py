@@ -1,7 +1,7 @@
-"""Judges a repository: makes every check of the table, and runs it in the sandbox for that.
+"""Judges a repository: runs it in the sandbox and makes every check of the table.
 
-What it answers is hostile: a report says what was seen from outside, and a check passes because
-our own comparison found nothing, never because the repository says so.
+Trust: the repository's answers are hostile. A report states what we observe from outside, and a
+check passes because our own comparison finds no fault, never because the repository says so.
 """
 
 from __future__ import annotations
@@ -52,20 +52,19 @@ _ITS_FAULT = (
     *(LoadError, DependencyError, RemoteEnvError, RemoteProtocolError),
     *(WorkerDiedError, WorkerTimeoutError),
 )
-"""Where it does not load: what the repository is to blame for."""
+"""Errors of loading for which the repository is to blame."""
 
 
 class _StoppedError(Exception):
-    """Nothing more can be asked of this task, or of the repository."""
+    """Ends the questions to this task, or to the repository."""
 
 
 def judge(asked: JudgeOptions, report: Report | None = None) -> Report:
-    """Judge a repository; ``report`` takes what is found as it is found, so that an interrupt loses
-    none of it.
+    """Judges a repository; ``report`` takes each finding at once, so that an interrupt loses none.
 
     Raises:
-        EnvHubError: It could not be judged: it could not be had, this host cannot confine it, or
-            a server is full. What the repository itself does wrong is a finding.
+        EnvHubError: The repository could not be judged: it is unreachable, this host cannot
+            confine it, or a server is full. A fault of the repository itself is a finding.
     """
     asked.tell(f"reading {asked.reference}")
     where = {name: asked.arguments.get(name) for name in ("hub_cache_dir", "token", "endpoint")}
@@ -89,8 +88,8 @@ def _limit(name: str, value: int) -> str:
 
 
 def is_moving(reference: str, snapshot: Snapshot) -> bool:
-    """Whether it need not mean this commit, or version, for ever; a repository's name can read like
-    a commit.
+    """Tells whether a reference may later mean another commit or version; a repository's name can
+    look like a commit.
     """
     if snapshot.is_local:
         return False
@@ -105,7 +104,7 @@ class _Judge:
         self._arguments = dict(asked.arguments)
         sandbox = asked.arguments.get("sandbox", "process")
         self._is_here = sandbox == "process"
-        if sandbox == "ray":  # else one play would keep the room that the next one waits for
+        if sandbox == "ray":  # else one play would hold the room that the next play waits for
             self._arguments["sandbox"] = RaySandbox(shared=True)
         self._files = parsing.read(snapshot)
         entry = self._files.get(snapshot.path)
@@ -114,7 +113,7 @@ class _Judge:
         self._unrecorded = ""
 
     def how(self) -> dict[str, str]:
-        """How it is judged, in the caller's words and ours."""
+        """Describes the settings of the judgement, in the caller's words and ours."""
         asked, policy = self._asked, self._policy
         limits = (_limit(name, value) for name, value in vars(policy.limits).items() if value)
         return {
@@ -172,13 +171,13 @@ class _Judge:
             self._report.judged("imports", [])
 
     def make(self, *, record_denials: bool = False, **changes: Any) -> EnvSuites:
-        """Its environments; of the very files that were read, or it cannot be judged."""
-        # a death that a restart hides would be no finding
+        """Makes the environments of the snapshot that was read; raises if its files changed."""
+        # without restarts, which would hide a death
         record = record_denials or self._policy.record_denials
         policy = replace(self._policy, restart="never", record_denials=record)
         given = {**self._arguments, "cfg": self._report.reference, **changes}
         suites = make_env(**{**given, "policy": policy, "limits": None})
-        if suites.provenance["commit"] != self._snapshot.commit:  # a folder of this machine
+        if suites.provenance["commit"] != self._snapshot.commit:  # a local folder has changed
             suites.close()
             raise SnapshotError(f"{self._asked.reference} changed during the check; check it again")
         return suites
@@ -196,7 +195,7 @@ class _Judge:
             self._report.judged("loads", [])
             try:
                 self._ask_tasks(suites)
-            finally:  # also where an interrupt ends it
+            finally:  # also after an interrupt
                 self._report.provenance = suites.provenance
                 self._note_confinement(suites.provenance)
 
@@ -224,13 +223,13 @@ class _Judge:
             self._report.raised("survives", error, message=f"while it loaded: {error}")
             return
         dated = self._with_older_packages(error)
-        if not isinstance(error, DependencyError):  # also a name that a terminal would obey
+        if not isinstance(error, DependencyError):  # or a name with control codes
             self._report.raised("loads", error, message=f"{error}{dated}")
         elif dated or "imports" not in {finding.id for finding in self._report.findings}:
             self._report.raised("imports", error, message=f"{error}{dated}")
 
     def _with_older_packages(self, error: EnvHubError) -> str:
-        """The latest of a few days whose packages cure an error of a start, where there is one."""
+        """Returns advice with the latest of a few days whose packages cure an error of a start."""
         if not self._is_here or self._arguments.get("dependencies", "auto") != "auto":
             return ""
         said = ""
@@ -247,21 +246,21 @@ class _Judge:
         return said
 
     def _denied(self, denied: Iterable[str] | None, task: str = "") -> None:
-        """What a jail was refused, where that was recorded."""
+        """Record a jail's denials as findings, if the jail recorded any."""
         if denied is not None:
             for check, findings in denial_findings(denied).items():
                 self._report.judged(check, findings, task)
 
     def _made_to_record(self) -> EnvSuites:
-        """Of which what they are denied is recorded, where a kernel and its containers let it be.
+        """Makes environments whose jails record denials, if kernel and container permit it.
 
-        That makes steps longer, so no time is measured in this play.
+        Recording slows steps down, so this play measures no times.
         """
         self._unrecorded = "" if self._is_here else "only --sandbox process records them"
         if self._is_here:
             try:
                 return self.make(record_denials=True, num_workers=1)
-            except SandboxUnavailableError as error:  # of the profile, too: then it is raised again
+            except SandboxUnavailableError as error:  # a fault of the profile is raised again
                 self._unrecorded = str(error)
         return self.make(num_workers=1)
 
@@ -269,7 +268,7 @@ class _Judge:
     def _stopping(self, task: str) -> Iterator[None]:
         try:
             yield
-        except (OutsideSpaceError, CustomSpaceError) as error:  # the latter's is of actions
+        except (OutsideSpaceError, CustomSpaceError) as error:  # CustomSpaceError is about actions
             check = "observation-space" if isinstance(error, OutsideSpaceError) else "runs"
             self._report.judged(check, [str(error)], task)
         except RemoteEnvError as error:

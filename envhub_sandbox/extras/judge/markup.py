@@ -1,7 +1,7 @@
-"""What pages for people are made of: text that is no markup, tables, plots; nothing runs.
+"""Builds pages for people: escaped text, tables and plots, without scripts.
 
-Whatever a stranger may have said goes through ``text``, which leaves no character that HTML gives a
-meaning to. The page's own policy forbids scripts, and everything that would come from elsewhere.
+All of a stranger's text goes through ``text``, which escapes every character with a meaning in
+HTML. The page's own policy forbids scripts and all content from elsewhere.
 """
 
 from __future__ import annotations
@@ -80,11 +80,11 @@ _POLICY = (
     f"default-src 'none'; style-src 'sha256-{_HASH}'; img-src data:; media-src data:; "
     "base-uri 'none'; form-action 'none'"
 )
-"""Of what a page may do, were there markup of a stranger's: not even look different."""
+"""The page's permissions: a stranger's markup, if any got in, could not even change its style."""
 
 
 def markup_page(title: str, body: Iterable[str]) -> str:
-    """A whole page in one file, of a body that is HTML of ours; the title may be a stranger's."""
+    """Returns a whole page in one file; the body is our HTML, the title may be a stranger's."""
     return "\n".join(
         [
             '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
@@ -100,17 +100,17 @@ def markup_page(title: str, body: Iterable[str]) -> str:
 
 
 def text(value: object, limit: int = _LONGEST) -> str:
-    """Text, and nothing but text: in a page as in an attribute of it."""
+    """Escapes a value as plain text, for a page or for an attribute."""
     return html.escape(printable(str(value), limit), quote=True)
 
 
 def data(kind: str, content: bytes) -> str:
-    """Bytes of ours as an address within the page: no others are shown."""
+    """Returns our bytes as a data URL: the page shows no other URLs."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def facts(rows: Iterable[tuple[object, object]], limit: int = _LONGEST) -> Iterator[str]:
-    """Names, and what is said of each; both may be a stranger's."""
+    """Yields a list of names and values; both may be a stranger's."""
     yield "<dl>"
     for name, value in rows:
         yield f"<dt>{text(name, limit)}</dt><dd>{text(value, limit)}</dd>"
@@ -118,16 +118,16 @@ def facts(rows: Iterable[tuple[object, object]], limit: int = _LONGEST) -> Itera
 
 
 def folded(summary: str, inside: Iterable[str]) -> Iterator[str]:
-    """HTML that is there when one asks for it."""
+    """Yields HTML that the reader can unfold."""
     yield f"<details><summary>{text(summary)}</summary>"
     yield from inside
     yield "</details>"
 
 
 def table(heads: Iterable[str], rows: Collection[tuple[str, ...]]) -> Iterator[str]:
-    """A table of cells that are HTML already, as many rows as a browser bears.
+    """Yields a table of HTML cells, limited to the rows that a browser can handle.
 
-    On a phone each row is a paragraph, with the head of its column before each cell.
+    On a phone each row is a paragraph, with the column's head before each cell.
     """
     names = [text(head) for head in heads]
     top = "".join(f"<th>{name}</th>" for name in names)
@@ -140,7 +140,7 @@ def table(heads: Iterable[str], rows: Collection[tuple[str, ...]]) -> Iterator[s
         yield f"<p>{len(rows) - _MOST_ROWS} more are left out.</p>"
 
 
-# --- plots as SVG: all that is drawn is numbers --------------------------------------------------
+# --- plots as SVG, which contain only numbers ----------------------------------------------------
 
 _WIDTH, _HEIGHT = 460, 150
 _LEFT, _RIGHT, _TOP, _BOTTOM = 6, 6, 18, 20
@@ -148,11 +148,11 @@ _WIDEST = 40
 _MOST_BARS = 64
 _BINS = 32
 _LARGEST = 1e100
-"""What is larger is drawn as this: differences of the largest floats are no floats."""
+"""The limit of drawn values: a difference of the largest floats overflows."""
 
 
 def bar_plot(name: str, values: Sequence[float]) -> str:
-    """One bar for each finite number, from zero; of too many, one for the mean of neighbours."""
+    """Draws one bar per finite number, from zero; averages neighbours if there are too many."""
     known = finite(values)
     if not len(known):
         return ""
@@ -176,11 +176,11 @@ def bar_plot(name: str, values: Sequence[float]) -> str:
 
 
 def histogram_plot(name: str, seconds: Sequence[float]) -> str:
-    """How often something took how long, with logarithmic steps; the median and the 99 %."""
+    """Draws the distribution of durations in logarithmic bins, with median and 99th percentile."""
     known = np.maximum(finite(seconds), 1e-7)
     if not len(known):
         return ""
-    bins = min(_BINS, max(3, len(known) // 2))  # a bar of a pixel is no share of a few values
+    bins = min(_BINS, max(3, len(known) // 2))  # few values need wide bins
     edges = np.geomspace(known.min() / 1.05, known.max() * 1.05, bins + 1)
     counts, _ = np.histogram(known, edges)
     wide, most = (_WIDTH - _LEFT - _RIGHT) / bins, float(counts.max())
@@ -204,11 +204,11 @@ def histogram_plot(name: str, seconds: Sequence[float]) -> str:
 
 
 def line_plot(name: str, values: Sequence[float], parts: Sequence[tuple[int, str]]) -> str:
-    """A line through numbers of bytes; ``parts`` are how many, and a word for where they end."""
+    """Draws numbers of bytes as a line; ``parts``: number of values and label of each part."""
     known = finite(values)
     if len(known) < 2 or len(known) != len(values):
         return ""
-    low, high = _range([0.0, *known.tolist()])  # from zero: no cliff of a thousandth
+    low, high = _range([0.0, *known.tolist()])  # from zero: small changes look small
     last = len(known) - 1
     points = [(_x(at / last), _y(value, low, high)) for at, value in enumerate(known.tolist())]
     path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
@@ -222,7 +222,7 @@ def line_plot(name: str, values: Sequence[float], parts: Sequence[tuple[int, str
     for count, word in parts:
         done += count
         share = (done - 1) / last
-        if count and share > ends[-1][0] + 0.15:  # or its word would lie on the one before
+        if count and share > ends[-1][0] + 0.15:  # else the label would overlap the previous one
             ends.append((share, word))
             if share < 1:
                 shown.append(_line(_x(share), _TOP, _x(share), _HEIGHT - _BOTTOM, "mark"))
@@ -232,7 +232,7 @@ def line_plot(name: str, values: Sequence[float], parts: Sequence[tuple[int, str
 
 
 def number(value: float) -> str:
-    """A number in few characters."""
+    """Formats a number in few characters."""
     if not math.isfinite(value):
         return "none"
     if 1_000 <= abs(value) < 1e6:
@@ -241,7 +241,7 @@ def number(value: float) -> str:
 
 
 def finite(values: Sequence[float]) -> NDArray[np.float64]:
-    """Those that can be drawn, none of them so large that a difference is no number."""
+    """Returns the finite values, clipped so that their differences are finite."""
     numbers = np.asarray(values, np.float64).reshape(-1)
     return np.clip(numbers[np.isfinite(numbers)], -_LARGEST, _LARGEST)
 
@@ -276,17 +276,17 @@ def _word(x: float, y: float, word: str, anchor: str) -> str:
 
 
 def _level(value: float, low: float, high: float) -> Iterator[str]:
-    """A line at a height, and its number above it."""
+    """Draws a horizontal line at a value, and the number above it."""
     y = _y(value, low, high)
     yield _line(_LEFT, y, _WIDTH - _RIGHT, y, "grid")
     if value > 0:
         yield _word(_LEFT, y - 4, number(value), "start")
-    elif value:  # at the other end: few bars begin at the left
+    elif value:  # at the right end: few bars begin at the left
         yield _word(_WIDTH - _RIGHT, y - 3, number(value), "end")
 
 
 def _below(words: Sequence[tuple[float, str]]) -> Iterator[str]:
-    """What stands under the plot: at its left end, at its right end, or between."""
+    """Draws the labels under a plot: at the left end, at the right end, or between."""
     for share, word in words:
         anchor = "start" if share <= 0.02 else "end" if share >= 0.98 else "middle"
         yield _word(_x(share), _HEIGHT - 4, word, anchor)

@@ -1,7 +1,7 @@
-"""A report as one page for people: HTML that needs nothing else, and runs nothing.
+"""Renders a report as one self-contained HTML page without scripts.
 
-Its texts are partly a stranger's. All of them go through ``markup.text``. Its pictures and plots
-are made here, of numbers.
+Its texts are partly a stranger's and all go through ``markup.text``. This module makes its pictures
+and plots from numbers.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from envhub_sandbox.play.plays import Film, Play
 from envhub_worker.protocol.text import counted, duration_text, size_text
 
 _MOST_PAIRS, _LONGEST_WORD = 1_000, 160
-"""Of files and of packages, each with what is said of it."""
+"""Files or packages to list, each with its value."""
 _MOST_TASKS = 40
-"""Of which there is more than a line."""
+"""Tasks to show with more than a line."""
 _MOST_PICTURES = 12 << 20
 """Bytes of all pictures and films together."""
 _RAN = ("repository", "repo_type", "commit", "path", "protocol")
 
 
 def page(report: Report, failures: Collection[Finding]) -> str:
-    """The whole page. Trust: whatever stands in a report may be a stranger's text."""
+    """Returns the whole page. Trust: a report's texts may be a stranger's."""
     body = [*_head(report, failures), *_findings(report, failures), *_tasks(report)]
     body += [*_figures(report), *_held(report), *_judged(report), *_ran(report.provenance or {})]
     return markup_page(f"envhub check: {report.reference}", body)
@@ -90,7 +90,7 @@ def _tasks(report: Report) -> Iterator[str]:
 
 
 def _fitting(film: Film, left: int) -> tuple[Film, int]:
-    """A film, or what of it the page can still hold; and what then is left."""
+    """Returns the part of a film that fits the page, and the bytes that remain."""
     stills = sum(map(len, film.stills))
     size = stills + len(film.video)
     if size <= left:
@@ -223,5 +223,5 @@ def _ran(provenance: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _pairs(value: object) -> list[tuple[str, Any]]:
-    """Trust: the worker's own words."""
+    """Returns the items of a mapping. Trust: the worker's own words."""
     return list(value.items()) if isinstance(value, Mapping) else []

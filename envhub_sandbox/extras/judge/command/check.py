@@ -36,7 +36,7 @@ SETTINGS = (
     *("timeout", "memory", "disk", "processes", "cpu_time"),
     "deadline",
 )
-"""What may stand in ``[check]`` of ``--settings FILE``, by the names in Python."""
+"""The permitted keys in ``[check]`` of ``--settings FILE``, by their names in Python."""
 _PANEL = "What it says"
 _FILE = "FILE"
 _MAY = "What it may do"
@@ -45,8 +45,8 @@ _FIGURES = ("suite / task", "episodes", "steps", "a step", "slowest")
 
 
 def _with_settings(ctx: typer.Context, path: Path | None) -> Path | None:
-    """Let the options that are read after this have the defaults of the caller's file."""
-    if path is not None and not ctx.resilient_parsing:  # as a completion is
+    """Set the defaults of later options from the caller's file."""
+    if path is not None and not ctx.resilient_parsing:  # completion parses resiliently
         from envhub_sandbox.extras.judge import settings
 
         with reported(debug=False):
@@ -192,7 +192,7 @@ def check(
 
     if listed is not None:
         _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
-        _arguments(make, policy)  # what cannot be is said before anything is judged
+        _arguments(make, policy)  # reject bad arguments before the first judgement
         from envhub_sandbox.extras.judge.command import list_run
 
         with no_report_but_ours([junit], "./"):
@@ -252,14 +252,14 @@ def _known(names: Sequence[str]) -> Sequence[str]:
 def judgement(
     make: opt.MakeOptions, policy: Path | None, deadline_s: float, *, quiet: bool, **play: Any
 ) -> Report:
-    """What comes of it until the deadline; ``play`` is what else ``JudgeOptions`` says."""
+    """Judges a repository until the deadline; ``play`` holds further fields of ``JudgeOptions``."""
     from envhub_sandbox.extras.judge import settings
     from envhub_sandbox.extras.judge.findings import Report
     from envhub_sandbox.extras.judge.judge import judge
 
     arguments = _arguments(make, policy)
     del arguments["cfg"]
-    arguments["policy"]["prewarm"] = 0  # a jail started ahead would be one more at once
+    arguments["policy"]["prewarm"] = 0  # a prewarmed jail would count as another jail
     report, doing = Report(make.ref, folder=settings.folder_below_here(make.ref)), ["starting"]
     with ProgressBar(quiet=quiet, long_s=_LONG_S) as bar, says_what_is_seen():
 
@@ -277,7 +277,7 @@ def judgement(
 
 
 def _arguments(make: opt.MakeOptions, policy: Path | None) -> dict[str, Any]:
-    """Arguments of ``make_env``, with a valid policy. Raises ``UsageError``, ``PolicyError``."""
+    """Returns arguments of ``make_env``. Raises ``UsageError``, ``PolicyError`` for the policy."""
     from envhub_sandbox.extras.judge import settings
     from envhub_sandbox.settings.policy import policy_from
 
@@ -289,7 +289,7 @@ def _arguments(make: opt.MakeOptions, policy: Path | None) -> dict[str, Any]:
 
 
 def _write(report: Report, failures: list[Finding], *files: Path | None) -> None:
-    """The files of ``--junit``, ``--sarif`` and ``--html``."""
+    """Write the files for ``--junit``, ``--sarif`` and ``--html``."""
     from envhub_sandbox.extras.judge import page, reports
 
     for path, form in zip(files, (reports.junit, reports.sarif, page.page), strict=True):
@@ -298,7 +298,7 @@ def _write(report: Report, failures: list[Finding], *files: Path | None) -> None
 
 
 def _print_confinement(report: Report) -> None:
-    """In the log of a workflow, too."""
+    """Print the confinement, also in the log of a workflow."""
     for word, text in () if report.confinement is None else report.confinement.rows():
         show(word, text)
 

@@ -1,9 +1,9 @@
-"""``--deadline``: an alarm that interrupts a judgement, whatever it waits for.
+"""``--deadline``: an alarm that interrupts a judgement.
 
-It comes as a Ctrl-C does, which everything here can be interrupted by: a download, an installation,
-a parser, a jail that hangs. What closes after it is interrupted too if it takes long. A call that
-obeys no signal, such as one to a name server, is waited for. Windows has no alarm: there a thread
-does what a Ctrl-C does.
+The alarm acts like Ctrl-C, which interrupts everything here: a download, an installation, a parser,
+a hanging jail. A second alarm interrupts a slow cleanup. A call that obeys no signal, such as a
+query to a name server, delays the alarm. Windows has no alarm: there a thread simulates
+Ctrl-C.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable, Iterator
 
 _AGAIN_S = 15.0
-"""After which what the alarm ended, and is still closing, is interrupted again."""
+"""The time after which another alarm interrupts a slow cleanup."""
 
 
 class DeadlineReached(KeyboardInterrupt):
@@ -25,7 +25,7 @@ class DeadlineReached(KeyboardInterrupt):
 
 @contextlib.contextmanager
 def deadline_alarm(seconds: float) -> Iterator[None]:
-    """Raise ``DeadlineReached`` in the main thread if this is not over after so many seconds."""
+    """Raise ``DeadlineReached`` in the main thread if the body runs longer than ``seconds``."""
     over = reached = False
 
     def ring() -> None:
@@ -38,7 +38,7 @@ def deadline_alarm(seconds: float) -> Iterator[None]:
         try:
             yield
         except Exception as error:
-            if reached:  # what was interrupted has made another error of it
+            if reached:  # the interrupted code has turned the alarm into another error
                 raise DeadlineReached from error
             raise
         finally:
@@ -47,7 +47,7 @@ def deadline_alarm(seconds: float) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _alarm(seconds: float, ring: Callable[[], None]) -> Iterator[None]:
-    """Call ``ring`` in the main thread after so many seconds, and again and again."""
+    """Call ``ring`` in the main thread after ``seconds``, and then repeatedly."""
     if sys.platform != "win32":
         left = threading.Event()
 

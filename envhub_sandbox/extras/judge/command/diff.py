@@ -1,4 +1,4 @@
-"""``envhub diff``: what is different between two commits, before a new pin is approved."""
+"""``envhub diff``: shows the differences between two commits, before approval of a new pin."""
 
 from __future__ import annotations
 
@@ -108,6 +108,6 @@ def _print(then: str, now: str, found: list[Change]) -> None:
         if change.lines:
             out()
             out(safe_line(change.text, 500), "bold")
-        for line in change.lines:  # which is a stranger's
+        for line in change.lines:  # Trust: a stranger's text
             out(f"{MARGIN}{safe_line(line, 300)}", {"+": GOOD, "-": DOUBTFUL}.get(line[:1]))
     say(f"{counted(len(found), 'change')}.", DOUBTFUL)

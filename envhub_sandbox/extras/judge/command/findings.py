@@ -1,4 +1,4 @@
-"""Findings as lines, ``--fail-on``, and GitHub's annotations."""
+"""Prints findings as lines and as GitHub's annotations, and reads ``--fail-on``."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from envhub_sandbox.extras.judge.findings import Finding
 
 _MOST_OF_A_SUMMARY = 1_000_000
-"""Characters, all of them ASCII: GitHub takes 1 MiB for each step."""
+"""Characters, all ASCII: GitHub takes 1 MiB per step."""
 STYLES = {"error": "red", "warning": "yellow", "note": "dim"}
 
 
 def show_finding(finding: Finding, *, fails: bool = False) -> None:
-    """Print what was found, and what cures it where it fails the whole."""
+    """Print a finding, and its cure if it fails the judgement."""
     severity = finding.check.severity.value
     task = f"{finding.task}: " if finding.task else ""
     show(severity, f"{finding.id}: {task}{finding.text}", STYLES[severity])
@@ -29,7 +29,7 @@ def show_finding(finding: Finding, *, fails: bool = False) -> None:
 
 
 def level(name: str) -> Severity:
-    """What ``--fail-on`` says. Raises ``UsageError``: it says something else."""
+    """Returns the severity for ``--fail-on``. Raises ``UsageError``: the name is unknown."""
     from envhub_sandbox.extras.judge.checks import Severity
 
     if name not in {severity.value for severity in Severity}:
@@ -38,8 +38,8 @@ def level(name: str) -> Severity:
 
 
 def write_report(path: Path, text: str, references: Iterable[str]) -> None:
-    """Write a report about these, in UTF-8 whatever the locale.
-    Raises ``UsageError``: it cannot be written; ``PolicyError``: one of them has put a link there.
+    """Write a report about these references, always in UTF-8.
+    Raises ``UsageError``: it is unwritable; ``PolicyError``: a repository has put a link there.
     """
     from envhub_sandbox.extras.judge.settings import refuse_link_of_the_judged
 
@@ -52,8 +52,8 @@ def write_report(path: Path, text: str, references: Iterable[str]) -> None:
 
 
 def annotate(commands: Iterable[str], summary: str) -> None:
-    """Print GitHub's workflow commands, and append to its step's summary, of which it shows nothing
-    where it is too long: then the last lines are left out.
+    """Print GitHub's workflow commands, and append to the step's summary. GitHub shows nothing of a
+    summary that is too long, so this function leaves out the last lines.
     """
     for line in commands:
         command(line)

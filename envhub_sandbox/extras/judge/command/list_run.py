@@ -1,8 +1,8 @@
-"""``envhub check --all FILE``: a list of repositories, judged one after the other.
+"""``envhub check --all FILE``: judges a list of repositories one after the other.
 
-References are the caller's words; findings, and why a repository could not be judged, are partly a
-stranger's text, which each form escapes. No result of an earlier run is read: a file that says what
-has passed could be the work of who is judged.
+Trust: references are the caller's; findings and errors are partly a stranger's text, which each
+report format escapes. A run reads no results of earlier runs: their file could be the work of a
+listed author.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _LONGEST = 500
 
 
 class Verdict(Enum):
-    """What came of a reference, the worst first."""
+    """The verdict on a reference, worst first."""
 
     FAILED = "failed"
     UNJUDGED = "not judged"
@@ -50,12 +50,12 @@ _COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "red", Verdict.UNJUDGED: "y
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What came of one reference.
+    """The result for one reference.
 
     Attributes:
-        report: None if there is none; also a deadline leaves one.
-        failures: The findings that fail it.
-        error: Why it could not be judged. Trust: partly a stranger's text.
+        report: None if there is none; a judgement that meets its deadline has a report.
+        failures: The findings that fail the reference.
+        error: The reason for a missing judgement. Trust: partly a stranger's text.
     """
 
     entry: ListEntry
@@ -66,14 +66,14 @@ class Result:
 
     @property
     def verdict(self) -> Verdict:
-        """Passed is only what was judged to its end."""
+        """Returns the verdict; only a complete judgement passes."""
         if self.report is None or self.report.is_unjudged(self.failures):
             return Verdict.UNJUDGED
         return Verdict.FAILED if self.failures else Verdict.PASSED
 
     @property
     def why(self) -> list[str]:
-        """Why it has not passed, a line for each check that fails it."""
+        """Returns the reasons for the verdict, a line for each failed check."""
         lines: dict[str, str] = {}
         for finding in self.failures:
             lines.setdefault(finding.id, f"{finding.id}: {finding.text}")
@@ -88,15 +88,15 @@ def judge_list(
     *,
     debug: bool,
 ) -> list[Result]:
-    """Judge each repository of a list.
+    """Judges each repository of a list.
 
     Args:
         file: The list; ``-`` is stdin.
-        files: The caller's files, by option: no repository of the list may have one.
-        debug: Whether tracebacks are shown.
+        files: The caller's files, by option; none may lie in a listed repository.
+        debug: Whether to show tracebacks.
 
-    Raises ``UsageError``: the list cannot be read; ``HubReferenceError``: a line of it;
-    ``PolicyError``: a file of the caller's lies in a repository of the list.
+    Raises ``UsageError``: the list is unreadable; ``HubReferenceError``: a line is wrong;
+    ``PolicyError``: one of the caller's files lies in a listed repository.
     """
     entries, results = _entries(file), []
     for entry in entries:
@@ -140,14 +140,14 @@ def judge_entry(
     *,
     debug: bool = False,
 ) -> Result:
-    """What comes of one reference; whatever it raises ends no other."""
+    """Judges one reference; an error does not end the run of the list."""
     begun = time.monotonic()
     report, error = None, ""
     try:
         report = judge(entry.reference)
     except Exception as caught:
         if isinstance(caught, BrokenPipeError) and not isinstance(caught, EnvHubError):
-            raise  # what is printed has no reader any more; a repository's own pipe is not that
+            raise  # nobody reads our output any more; a repository's broken pipe differs
         error = printable(f"{caught}" or type(caught).__name__)
         if debug:
             say(console.safe_text(traceback.format_exc()))
@@ -157,13 +157,13 @@ def judge_entry(
 
 
 def worst_first(results: Iterable[Result]) -> list[Result]:
-    """Those that failed, those that could not be judged, those that passed."""
+    """Sorts results: failed, not judged, passed."""
     order = list(Verdict)
     return sorted(results, key=lambda result: order.index(result.verdict))
 
 
 def exit_code(results: Sequence[Result]) -> Exit:
-    """The worst verdict's."""
+    """Returns the exit code for the worst verdict."""
     verdicts = {result.verdict for result in results}
     if Verdict.FAILED in verdicts:
         return Exit.ENVIRONMENT
@@ -171,8 +171,8 @@ def exit_code(results: Sequence[Result]) -> Exit:
 
 
 def write_junit(path: Path, results: Sequence[Result]) -> None:
-    """Write the file of ``--junit``. Raises ``UsageError``: it cannot be written; ``PolicyError``:
-    a repository of the list has put a link there.
+    """Write the file for ``--junit``. Raises ``UsageError``: it is unwritable; ``PolicyError``: a
+    listed repository has put a link there.
     """
     root = ElementTree.Element("testsuites", name="envhub check")
     root.extend(map(_suite, results))
@@ -182,7 +182,7 @@ def write_junit(path: Path, results: Sequence[Result]) -> None:
 
 
 def _suite(result: Result) -> ElementTree.Element:
-    """One of JUnit's suites: the checks as test cases, or an error that says why not."""
+    """Returns a JUnit suite: the checks as test cases, or an error for a missing judgement."""
     if result.report is not None:
         suite = reports.suite(result.report, result.failures)
     else:
@@ -198,7 +198,7 @@ def _suite(result: Result) -> ElementTree.Element:
 
 
 def show_results(results: Sequence[Result], *, json: bool, github: bool) -> None:
-    """Print what has come of it, and end with its code. Raises ``Exit``: not all passed."""
+    """Print the results. Raises ``Exit`` with the exit code: not all references passed."""
     counts = Counter(result.verdict for result in results)
     words = ", ".join(
         f"{counts[verdict]} {verdict.value}" for verdict in Verdict if counts[verdict]
@@ -235,7 +235,7 @@ def _document(result: Result) -> dict[str, Any]:
 
 
 def _workflow_commands(results: Iterable[Result]) -> Iterator[str]:
-    """One of GitHub's annotations for each reference that did not pass."""
+    """Yields a GitHub annotation for each reference that did not pass."""
     for result in results:
         if result.verdict is not Verdict.PASSED:
             words = "\n".join([result.verdict.value, *result.why])
@@ -244,7 +244,7 @@ def _workflow_commands(results: Iterable[Result]) -> Iterator[str]:
 
 
 def _summary(results: Iterable[Result], words: str) -> str:
-    """A table for GitHub's step summary; a stranger's text is no markup there."""
+    """Returns a table for GitHub's step summary; escapes a stranger's text."""
     lines = [f"### envhub check: {words}", "", "| | reference | |", "| --- | --- | --- |"]
     for result in results:
         cells = (printable(result.entry.reference, _LONGEST), "; ".join(result.why))

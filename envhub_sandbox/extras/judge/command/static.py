@@ -1,4 +1,4 @@
-"""``envhub inspect --static``: what a repository would do, read without running it."""
+"""``envhub inspect --static``: shows the content of a repository without running it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _PLAIN = ("Python", "text")
 def inspect_static(
     ref: str, *, as_json: bool, sarif: Path | None, fail_on: str | None, make: opt.MakeOptions
 ) -> None:
-    """Read a repository, and say what is in it."""
+    """Read a repository and print a description of its content."""
     least = None if fail_on is None else level(fail_on)
     with no_report_but_ours([sarif], ref):
         with ProgressBar(quiet=as_json) as bar:
@@ -78,7 +78,7 @@ def _print_files(read: Static) -> None:
     counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
     total = size_text(sum(file.record.size for file in read.files))
     show("files", f"{len(read.files)}, {total}: {counts}")
-    # first what is large or no text: a reader would miss it
+    # large and binary files first: a reader would miss them among the others
     odd = [file for file in read.files if file.record.size >= LARGE or file.kind not in _PLAIN]
     rest = [file for file in read.files if file not in odd]
     for file in (shown := [*odd, *rest][:_SHOWN]):

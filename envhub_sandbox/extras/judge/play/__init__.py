@@ -1,1 +1,1 @@
-"""What is seen while a repository is played for a verdict."""
+"""Plays a repository for a verdict, and records what it does."""

@@ -1,7 +1,7 @@
-"""Whether the observations of a play are members of their space, value by value.
+"""Checks whether the observations of a play are members of their space, value by value.
 
-The client checks shapes, dtypes and structures at every step; values only ``check`` looks at,
-because many environments leave their own bounds and train all the same.
+The client checks shapes, dtypes and structures at every step; only ``check`` compares values,
+because many environments leave their own bounds and can still be trained on.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _SHOWN = 200
 
 
 class OutsideSpaceError(Exception):
-    """An observation is no member of its space."""
+    """An observation is outside its space."""
 
 
 def check_observations(
@@ -35,12 +35,12 @@ def check_observations(
     if not batches.is_batch(batched, single, env.num_envs):  # the repository's own vector class
         _check(batched, operation, {0: observations})
     elif isinstance(single, OpaqueSpace):
-        return  # its members are not known here
+        return  # this process cannot test membership
     else:
         try:
             each = batches.members(single, batched, observations, env.num_envs)
             members = dict(enumerate(each))
-        except Exception as error:  # from a vector class of the repository's own
+        except Exception as error:  # from the repository's own vector class
             seen = batches.shown(observations)
             text = f"{operation} returned {seen}, which is no batch of observations for {batched}"
             raise OutsideSpaceError(text) from error
@@ -60,7 +60,7 @@ def _check(space: gym.Space[Any], operation: str, observations: Mapping[int, Any
 
 
 def holds(space: gym.Space[Any], member: Any) -> bool:
-    """Whether a value is in a space; numbers of another dtype count by their value."""
+    """Tells whether a value is in a space; numbers of another dtype count by their value."""
     if isinstance(space, OpaqueSpace):
         return True
     if isinstance(space, spaces.Dict):

@@ -1,6 +1,6 @@
-"""Single probes of an environment: what episodes leave behind, what render gives, LeRobot's needs.
+"""Probes of an environment: leaks of episodes, results of render, and the needs of LeRobot.
 
-Leaks are counted from outside. Followed for LeRobot: ``preprocess_observation`` of
+Leaks are counted from outside. The needs follow ``preprocess_observation`` of
 ``lerobot.envs.utils``, and ``rollout`` of ``lerobot_eval``.
 """
 
@@ -28,8 +28,8 @@ _LEAST = {
     "files": ("leaks-files", 2),
     "memory_bytes": ("leaks-memory", 1 << 20),
 }
-"""The check of each, and what a round has to add: pools that are filled once, and the allocator,
-add less or once."""
+"""The check for each resource, and the least growth per round that counts: pools that fill once and
+the allocator add less, or only once."""
 LEAK_CHECKS = tuple(check for check, _ in _LEAST.values())
 
 Usage = dict[str, int]
@@ -38,7 +38,7 @@ Usage = dict[str, int]
 def usage_per_round(
     begin: Callable[[], Any], usage: Callable[[], Usage], resets: int, tell: Callable[[str], None]
 ) -> list[Usage]:
-    """What is held after each round of resets; a first round warms up. Empty if nothing counts."""
+    """Returns the usage after each round of resets; the first warms up. Empty if nothing counts."""
     seen = []
     for number in range(_ROUNDS + 1):
         tell(f"{resets} resets, round {number + 1} of {_ROUNDS + 1}")
@@ -49,10 +49,10 @@ def usage_per_round(
 
 
 def leak(seen: Sequence[Usage], resets: int) -> tuple[str, str] | None:
-    """The check of what grew in every round, and in what words; None if nothing did.
+    """Returns the check for the resource that grew in every round, and a text; None if none grew.
 
-    A process that was left has threads and memory of its own, and pipes to it; a thread has a
-    stack: only the first of them is reported.
+    Reports only the first resource: a leftover process also has threads, memory and pipes, and a
+    thread has a stack.
     """
     for what, (check, least) in _LEAST.items():
         counts = [usage[what] for usage in seen]
@@ -63,16 +63,16 @@ def leak(seen: Sequence[Usage], resets: int) -> tuple[str, str] | None:
     return None
 
 
-# --- what render gives, held against the mode that it was asked in -------------------------------
+# --- results of render, compared with the requested mode -----------------------------------------
 
 MODES = ("rgb_array", "rgb_array_list", "ansi")
-"""Those that need no display, and of which one knows what they give."""
+"""Modes that need no display and have a known type of result."""
 
 FILMED = ("rgb_array", "rgb_array_list")
 
 
 def other_modes(env: VectorEnv[Any, Any, Any]) -> list[str]:
-    """The modes that it declares and is not in. Trust: input from the worker."""
+    """Returns the declared modes other than the current one. Trust: input from the worker."""
     declared = env.metadata.get("render_modes")
     declared_modes = declared if isinstance(declared, (list, tuple)) else ()
     named = {mode for mode in declared_modes if isinstance(mode, str)}
@@ -80,7 +80,7 @@ def other_modes(env: VectorEnv[Any, Any, Any]) -> list[str]:
 
 
 def wrong_frames(env: VectorEnv[Any, Any, Any]) -> Iterator[str]:
-    """What its mode does not permit, of the first sub-environment that gives it."""
+    """Yields the first result of render that the mode does not permit."""
     mode = env.render_mode
     if mode not in MODES:
         return
@@ -102,16 +102,16 @@ def _fits(result: Any, mode: str) -> bool:
     return is_frame(result)
 
 
-# --- what LeRobot needs --------------------------------------------------------------------------
+# --- the needs of LeRobot ------------------------------------------------------------------------
 
 _SEEN = ("agent_pos", "environment_state", "pixels")
 _PROCESSED = ("camera_obs", "policy", "robot_state")
-"""Observation keys from which LeRobot's processors make those that its policies see."""
+"""Observation keys from which LeRobot's processors make the keys for its policies."""
 _LONGEST = 100
 
 
 def step_limit(env: Any) -> int | None:
-    """The steps after which it says that it ends an episode. Trust: the worker's word."""
+    """Returns the declared limit of steps per episode. Trust: the worker's word."""
     stated = [getattr(env.spec, "max_episode_steps", None)]
     with contextlib.suppress(AttributeError, RemoteEnvError, TypeError):
         stated += env.get_attr("_max_episode_steps")
@@ -121,8 +121,8 @@ def step_limit(env: Any) -> int | None:
 def lerobot_lacks(
     env: VectorEnv[Any, Any, Any], episodes: Sequence[Episode] = (), keys: Collection[str] = ()
 ) -> Iterator[str]:
-    """At most one text: what an evaluation by LeRobot would miss.
-    ``keys``: of infos at ends of episodes, which may tell a success by another name.
+    """Yields at most one text: the unmet needs of an evaluation by LeRobot.
+    ``keys``: keys of infos at ends of episodes, which may report success under another name.
     """
     observations, actions = env.single_observation_space, env.single_action_space
     lacks = []
@@ -141,7 +141,7 @@ def lerobot_lacks(
         others = ", ".join(sorted(map(repr, alike)))
         instead = f", not {printable(others, _LONGEST)}" if others else ""
         lacks.append(f"info['is_success'] at the end of an episode{instead}")
-    rate = getattr(env, "_manifest", env).metadata.get("render_fps")  # as the repository has it
+    rate = getattr(env, "_manifest", env).metadata.get("render_fps")  # the repository's own value
     if env.render_mode in FILMED and rate is not None and not hasattr(rate, "numerator"):
         lacks.append(f"a whole number as metadata['render_fps'] for its videos, not {rate}")
     if lacks:
@@ -149,7 +149,7 @@ def lerobot_lacks(
 
 
 def _named(space: spaces.Space[Any]) -> str:
-    """A space without the bounds of its numbers, of which there may be many."""
+    """Describes a space without the bounds of its numbers, which may be many."""
     if isinstance(space, spaces.Box):
         return f"a Box of shape {space.shape}"
     if isinstance(space, spaces.Dict):
@@ -158,7 +158,7 @@ def _named(space: spaces.Space[Any]) -> str:
 
 
 def has(env: Any, name: str) -> bool:
-    """Whether its sub-environments have an attribute of that name, or a wrapper around them."""
+    """Tells whether the sub-environments or their wrappers have an attribute of that name."""
     try:
         env.get_attr(name)
     except (AttributeError, RemoteEnvError):
@@ -167,7 +167,7 @@ def has(env: Any, name: str) -> bool:
 
 
 def is_statistics(env: Any, name: str) -> bool:
-    """Whether this attribute of the sub-environments is one of Gymnasium's running statistics."""
+    """Tells whether the sub-environments' attribute is one of Gymnasium's running statistics."""
     try:
         [value, *_] = env.get_attr(name)
     except (AttributeError, RemoteEnvError, ValueError):
