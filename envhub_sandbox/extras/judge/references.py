@@ -1,4 +1,4 @@
-"""The list: one reference a line, and what is wrong with it is said before anything is run."""
+"""Reads a list of references, one per line, and reports all its errors before anything runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from envhub_worker.protocol.text import first_of, printable, size_text
 
 MOST_BYTES = 1 << 20
 MOST = 2_000
-"""References: a page of as many rows is one that people can read."""
+"""References: people can still read a page with so many rows."""
 _LONGEST = 4_096
 _SHOWN = 20
 
@@ -27,8 +27,8 @@ class ListEntry:
     """One reference of a list.
 
     Attributes:
-        reference: As it is run and shown.
-        meaning: The same for every way to write it.
+        reference: The text to run and to show.
+        meaning: The normal form, equal for every spelling of the reference.
     """
 
     reference: str
@@ -37,10 +37,10 @@ class ListEntry:
 
 
 def read_entries(file: IO[bytes], title: str) -> list[ListEntry]:
-    """The references of a list. Empty lines, and those that begin with ``#``, are none.
-    ``file``: the list, in UTF-8. A folder in it is looked for from the current one.
-    Raises ``HubReferenceError``: something in it is no reference, no folder that is here, or stands
-    there twice; or there is too much, or nothing.
+    """Reads the references of a list. Skips empty lines and those that begin with ``#``.
+    ``file``: the list, in UTF-8. Folders in it are relative to the current folder.
+    Raises ``HubReferenceError``: a line is no reference, names no existing folder, or repeats
+    another line; or the list is too long or empty.
     """
     data = file.read(MOST_BYTES + 1)
     if len(data) > MOST_BYTES:
@@ -64,7 +64,7 @@ def read_entries(file: IO[bytes], title: str) -> list[ListEntry]:
 
 
 def _read_into(entries: dict[str, ListEntry], text: str) -> Iterator[tuple[int, str]]:
-    """Take every line; yield where something is wrong, and what."""
+    """Parse every line; yield the number and the text of each error."""
     for number, line in enumerate(re.split("\r\n|\r|\n", text), 1):
         written = line.strip()
         if not written or written.startswith("#"):

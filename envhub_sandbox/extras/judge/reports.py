@@ -1,7 +1,7 @@
-"""A report in the forms that others read: JSON, JUnit's XML, SARIF, and GitHub's annotations.
+"""Writes a report for other programs: JSON, JUnit's XML, SARIF, and GitHub's annotations.
 
-Its texts are partly a stranger's: they are printable and bounded when they get here, and each form
-escapes what means something in it.
+Its texts are partly a stranger's: they arrive printable and bounded, and each format escapes its
+special characters.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from envhub_sandbox.extras.judge.findings import Finding, Report
 
 _SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 _GITHUB = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.NOTE: "notice"}
-# what XML 1.0 has no way to write at all
+# characters that XML 1.0 cannot express
 _NO_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def document(report: Report, failures: Sequence[Finding]) -> dict[str, Any]:
-    """Everything, as plain data."""
+    """Returns the whole report as plain data."""
     return {
         "reference": report.reference,
         "commit": report.commit,
@@ -47,18 +47,18 @@ def document(report: Report, failures: Sequence[Finding]) -> dict[str, Any]:
 
 
 def junit(report: Report, failures: Sequence[Finding]) -> str:
-    """One test case for each check of each task; what does not fail the whole is its output."""
+    """Returns a test case for each check of each task; harmless findings are its output."""
     return xml(suite(report, failures))
 
 
 def xml(root: ElementTree.Element) -> str:
-    """A document as text."""
+    """Returns a document as text."""
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 
 
 def suite(report: Report, failures: Sequence[Finding]) -> ElementTree.Element:
-    """A report as one of JUnit's suites."""
+    """Returns a report as a JUnit suite."""
     asked = dict.fromkeys(
         [*((finding.id, finding.task) for finding in report.findings), *report.passed]
     )
@@ -97,12 +97,12 @@ def _case(suite: ElementTree.Element, check: str, task: str) -> ElementTree.Elem
 
 
 def xml_text(text: str) -> str:
-    """Without what XML cannot say."""
+    """Replaces characters that XML cannot express."""
     return _NO_XML.sub("?", text)
 
 
 def sarif(report: Report, failures: Sequence[Finding]) -> str:
-    """SARIF 2.1.0. What stands in no file is said of the entry file's folder."""
+    """Returns SARIF 2.1.0. A finding without a file is placed at the entry file's folder."""
     rules = [
         {
             "id": check.id,
@@ -138,13 +138,13 @@ def _result(finding: Finding, failures: Sequence[Finding], folder: str) -> dict[
 
 
 def _sarif_text(text: str) -> str:
-    """Without SARIF's embedded links and placeholders."""
+    """Escapes SARIF's embedded links and placeholders."""
     plain = re.sub(r"([\\\[\]])", r"\\\1", text)
     return plain.replace("{", "{{").replace("}", "}}")
 
 
 def workflow_commands(report: Report) -> Iterator[str]:
-    """GitHub's workflow commands, one a line: a stranger's text cannot begin another."""
+    """Yields GitHub's workflow commands, one a line: a stranger's text cannot begin another."""
     for finding in report.findings:
         location = f"file={_property(report.folder + finding.file)}," if finding.file else ""
         location += f"line={finding.line}," if finding.line else ""
@@ -157,7 +157,7 @@ def workflow_commands(report: Report) -> Iterator[str]:
 
 
 def workflow_command(level: str, title: str, text: str, place: str = "") -> str:
-    """One of them; a place has its properties escaped already."""
+    """Returns a workflow command; the properties in ``place`` must be escaped already."""
     return f"::{level} {place}title={_property(title)}::{_data(text)}"
 
 
@@ -170,7 +170,7 @@ def _property(text: str) -> str:
 
 
 def summary(report: Report, failures: Collection[Finding]) -> str:
-    """A table for GitHub's step summary; a stranger's text is no markup there."""
+    """Returns a table for GitHub's step summary; escapes a stranger's text."""
     lines = [f"### envhub check: {report.verdict(failures)}", "", cell(report.reference), ""]
     if report.confinement is not None:
         lines += [*(f"- {cell(line)}" for line in report.confinement.lines()), ""]
@@ -183,7 +183,7 @@ def summary(report: Report, failures: Collection[Finding]) -> str:
 
 
 def cell(text: str) -> str:
-    """A cell of a table in Markdown: each character that means something there by its number."""
+    """Returns a cell of a Markdown table; special characters become numeric references."""
     return re.sub(
         r"[^a-zA-Z0-9 ,;=-]", lambda found: f"&#{ord(found[0])};", text.replace("\n", " ")
     )

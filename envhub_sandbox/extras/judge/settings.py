@@ -1,6 +1,6 @@
-"""How a repository is judged, and the files of the caller's that say so: a policy, and options.
+"""The settings of a judgement, and the caller's files for them: a policy, and options.
 
-Nothing of the repository that is judged is read here: it has no say in how it is judged.
+Trust: this module reads no file of the judged repository, which has no say in its judgement.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ _LONGEST = 500
 
 @dataclass(frozen=True, kw_only=True)
 class JudgeOptions:
-    """What is judged, and how.
+    """The repository to judge, and the settings of the judgement.
 
     Attributes:
-        arguments: Of ``make_env``, beyond the reference.
+        arguments: Arguments of ``make_env`` beside the reference.
         seed, steps: The seed and the steps of each play.
         resets: Resets in each of four rounds that look for leaks; 0 skips them.
         slow_step_s: Longest permitted median step; resets may take five times as long.
-        episode_steps: In which some episode has to end, if 30 seconds suffice for them.
+        episode_steps: Steps within which an episode must end, if 30 seconds suffice for them.
         tasks: Chooses ``(suite, task)`` pairs of the environments.
-        pictures: Also gather what only a page shows: frames, and memory over time.
+        pictures: Whether to gather data that only the page shows: frames, and memory over time.
     """
 
     reference: str
@@ -57,7 +57,7 @@ class JudgeOptions:
 
 
 def merged_settings(policy: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """A file's policy, changed by what was given as options, limit by limit.
+    """Merges a file's policy with the caller's options, which win limit by limit.
     Raises ``PolicyError``: the file's limits are no table.
     """
     limits = policy.get("limits", {})
@@ -68,11 +68,11 @@ def merged_settings(policy: Mapping[str, Any], given: Mapping[str, Any]) -> dict
 
 
 def read_settings(path: Path, known: Collection[str]) -> dict[str, Any]:
-    """The options in ``[check]`` of a caller's file, by their names in Python, of those ``known``.
+    """Reads the options in ``[check]`` of a caller's file, by their names in Python.
 
-    It is named, and never looked for: the folder that one is in may be a stranger's clone, and a
-    file that lies there would let him say what he may do and what fails him.
-    Raises ``PolicyError``: the file cannot be read, or says what there is not.
+    The caller must name the file; nothing searches for it. The current folder may be a stranger's
+    clone, whose own file would let him set his permissions and the checks that fail him.
+    Raises ``PolicyError``: the file is unreadable, or has an option that is not ``known``.
     """
     document = read_file(path)
     if tables := sorted(set(document) - {"check"}):
@@ -98,8 +98,8 @@ def read_settings(path: Path, known: Collection[str]) -> dict[str, Any]:
 
 
 def is_judged(path: Path, reference: str) -> bool:
-    """Whether a file lies in what is judged, by whatever links one gets there; or is named so, and
-    a link in there leads out.
+    """Tells whether a file lies in the judged folder, by any path of links; or whether its name
+    does, though a link there leads out.
     """
     folder = _folder_of(reference)
     if folder is None:
@@ -109,18 +109,18 @@ def is_judged(path: Path, reference: str) -> bool:
 
 
 def _folder_of(reference: str) -> str | None:
-    """Where what is judged lies, without links; None for what is not of this machine."""
+    """Returns the judged folder, links resolved; None for a reference that is not local."""
     if not is_here(reference):
         return None
     try:
         return os.path.realpath(split_local(reference).folder)
     except EnvHubError:
-        return None  # nothing is judged: what reads it says why
+        return None  # the judgement fails too, and its error says why
 
 
 def folder_below_here(reference: str) -> str:
-    """Where what is judged lies below the current folder, with a slash at its end; empty where it
-    is that folder, or lies elsewhere.
+    """Returns the judged folder's path below the current folder, with a slash at its end; empty if
+    they are equal or it lies elsewhere.
     """
     folder, here = _folder_of(reference), Path(os.path.realpath(os.curdir))
     if folder is None or here not in Path(folder).parents:
@@ -129,29 +129,29 @@ def folder_below_here(reference: str) -> str:
 
 
 def _named_in(path: Path, folder: str) -> Path | None:
-    """Where a path below a folder leads, if none of the links in there is followed."""
+    """Resolves a path up to the folder, but follows no link inside the folder."""
     absolute = Path(os.path.abspath(path))
     tops = [parent for parent in absolute.parents if os.path.realpath(parent) == folder]
     return Path(folder, absolute.relative_to(tops[-1])) if tops else None
 
 
 def _named_in_checkout(path: Path, reference: str) -> Path | None:
-    """``_named_in`` of the checkout of git that the judged folder lies in, or of the folder."""
+    """Applies ``_named_in`` to the git checkout around the judged folder, or to the folder."""
     if not is_here(reference):
         return None
-    # a checkout need not have the folder any more
+    # the checkout may have lost the folder
     folder = Path(_folder_of(reference) or os.path.realpath(os.path.expanduser(reference)))
     return _named_in(path, str(top_of(folder) or folder))
 
 
 def is_in_its_checkout(path: Path, reference: str) -> bool:
-    """Whether a place lies in what is judged, or in the checkout of git around that."""
+    """Tells whether a path lies in the judged folder or in the git checkout around it."""
     return _named_in_checkout(Path(os.path.realpath(path)), reference) is not None
 
 
 def refuse_link_of_the_judged(path: Path, reference: str) -> None:
-    """No repository says where a report goes: a link that it has there, or that its checkout has,
-    could lead to any file of the user's. Raises ``PolicyError``: there is one.
+    """Refuse a report's path that leads through a link of the judged repository or its checkout:
+    the link could lead to any file of the user's. Raises ``PolicyError``.
     """
     named = _named_in_checkout(path, reference)
     if named is not None and Path(os.path.realpath(path)) != named:
@@ -163,15 +163,15 @@ def refuse_link_of_the_judged(path: Path, reference: str) -> None:
 
 @contextlib.contextmanager
 def no_report_but_ours(places: Collection[Path | None], reference: str) -> Iterator[None]:
-    """Where a judgement ends without its reports, let none of the repository's own stand there:
-    CI would show as a result what its author has written.
+    """Remove the repository's own files from the paths of reports if a judgement ends without them:
+    CI would show the author's text as a result.
     """
     try:
         yield
     except BaseException:
         for path in filter(None, places):
             named = _named_in_checkout(path, reference)
-            # a link there goes, too; behind a link lies what is not the repository's
+            # also removes a link; a file behind a linked folder is not the repository's
             if named is not None and Path(os.path.realpath(path.parent)) == named.parent:
                 with contextlib.suppress(OSError):
                     path.unlink(missing_ok=True)
@@ -181,8 +181,8 @@ def no_report_but_ours(places: Collection[Path | None], reference: str) -> Itera
 def refuse_files_of_the_judged(
     places: Mapping[str, Path | None], reference: str, where: str = ""
 ) -> None:
-    """No repository says how it is judged, and none holds what is found in it: refuse such places.
-    Raises ``PolicyError``: one lies in it.
+    """Refuse settings and reports in the judged repository: it must neither decide how it is judged
+    nor hold its own results. Raises ``PolicyError``.
     """
     for option, path in places.items():
         if path is not None and is_judged(path, reference):
@@ -193,12 +193,12 @@ def refuse_files_of_the_judged(
 
 
 def read_policy(path: Path) -> dict[str, Any]:
-    """The fields of a ``Policy`` in a caller's file.
-    Raises ``PolicyError``: it cannot be read, or a field is wrong; the text names the file.
+    """Reads the fields of a ``Policy`` from a caller's file.
+    Raises ``PolicyError``: it is unreadable or a field is wrong; the text names the file.
     """
     fields = read_file(path)
     try:
-        with use_option_names(in_python):  # the file has those names, not the command line's
+        with use_option_names(in_python):  # errors name fields as the file does
             policy_from(fields, None)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from error
@@ -206,8 +206,8 @@ def read_policy(path: Path) -> dict[str, Any]:
 
 
 def read_file(path: Path) -> dict[str, Any]:
-    """A caller's TOML.
-    Raises ``PolicyError``: it cannot be read.
+    """Reads a caller's TOML file.
+    Raises ``PolicyError``: it is unreadable.
     """
     try:
         with path.open("rb") as file:

@@ -1,8 +1,8 @@
-"""``Static``: all that is read of a repository without running it, put together and as JSON.
+"""``Static``: everything that is read from a repository without running it, also as JSON.
 
-``survey`` looks at each file: its kind, and findings in it. What is found is a hint for a person
-and no wall: who wants to hide a call can. The walls are the sandbox's. What could not be read is
-found, too. ``undeclared`` says which of the imports nothing declares.
+``survey`` finds the kind of each file and its suspicious contents. Findings are hints for people:
+an author can hide a call, and only the sandbox protects. Unread files are findings, too.
+``undeclared`` lists imports that no declared package brings.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ _MOST_BYTES_OF_TEXT = 1 << 20
 _MOST_BYTES_IN_ALL = 32 << 20
 _MOST_OF_A_FILE = 100
 _MOST = 20_000
-"""Findings: as many as there may be files."""
+"""Findings to keep: the limit of files is the same."""
 _OF_EACH = 20
-"""Of one check, which are kept whatever there is of others."""
+"""Findings to keep for each check beyond that."""
 _LONGEST_LINK = 1024
 _SHOWN_IGNORED = 10
 
 
 @dataclass(frozen=True)
 class File:
-    """One file. ``kind``: as in ``"Python"``, ``"text"``, ``"binary"``, ``"machine code"``."""
+    """One file. ``kind``: such as ``"Python"``, ``"text"``, ``"binary"``, ``"machine code"``."""
 
     record: FileRecord
     kind: str
@@ -56,14 +56,14 @@ class File:
 
 @dataclass
 class Survey:
-    """What was read. ``findings``: what is worth a look, file by file."""
+    """The files that were read. ``findings``: suspicious contents, file by file."""
 
     files: list[File] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
     def add(self, found: Iterable[Finding]) -> None:
-        """Take what was found in one place, as far as there is room."""
+        """Add the findings of one check or file, up to the limits."""
         for finding in found:
             self._kept[finding.id] += 1
             if len(self.findings) < _MOST or self._kept[finding.id] <= _OF_EACH:
@@ -71,9 +71,9 @@ class Survey:
 
 
 def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Survey:
-    """Look at every file of a repository, and at what ``parsing.read`` read of it."""
+    """Examines every file of a repository, and the result of ``parsing.read``."""
     surveyed = Survey()
-    if snapshot.repo_type != "pypi":  # whose one file is ours
+    if snapshot.repo_type != "pypi":  # its only file is ours
         surveyed.add(_papers(snapshot))
     surveyed.add(_in_place(snapshot))
     surveyed.add(_in_front(snapshot))
@@ -105,7 +105,7 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Surve
 
 
 def bytes_of(path: Path, most: int, start: int = 0) -> bytes:
-    """So many of a file; none of one that cannot be read."""
+    """Returns a part of a file; empty for an unreadable file."""
     try:
         with path.open("rb") as file:
             file.seek(start)
@@ -146,7 +146,7 @@ def _unread(record: FileRecord, why: str) -> Finding:
 
 
 def _in_place(snapshot: Snapshot) -> Iterator[Finding]:
-    """Links, and where a folder is not what its commit is."""
+    """Yields findings about links, and about a folder that differs from its commit."""
     if not snapshot.is_local:
         yield from _links(snapshot)
         return
@@ -166,7 +166,7 @@ def _in_place(snapshot: Snapshot) -> Iterator[Finding]:
 
 
 def _links(snapshot: Snapshot) -> Iterator[Finding]:
-    """Links of git's, which come from the Hub, and so from a checkout, as files with their text."""
+    """Finds git's links, which the Hub, and so a checkout, stores as files with their target."""
     there = {record.path for record in snapshot.files}
     there |= {str(parent) for path in there for parent in PurePosixPath(path).parents}
     for record in snapshot.files:
@@ -177,7 +177,7 @@ def _links(snapshot: Snapshot) -> Iterator[Finding]:
 
 
 def _links_of_folder(here: LocalFolder) -> Iterator[Finding]:
-    """Links were followed when the folder was copied, and lead nowhere else."""
+    """Finds links that the copy of a folder followed; their targets lie inside the folder."""
     for file in here.files():
         if file.source != here.root / file.path:
             target = file.source.relative_to(here.root)
@@ -208,13 +208,13 @@ def _left_out(here: LocalFolder) -> Iterator[Finding]:
 
 
 def _in_front(snapshot: Snapshot) -> Iterator[Finding]:
-    """Extension modules that Python imports rather than the source beside them."""
+    """Finds extension modules that Python imports instead of the source beside them."""
     there = {record.path for record in snapshot.files}
     for path in sorted(path for path in there if path.endswith(".so")):
         folder, slash, name = path.rpartition("/")
         module = name.partition(".")[0]
         sources = [f"{folder}{slash}{module}.py"]
-        if folder and module == "__init__":  # a package comes before a module of its name
+        if folder and module == "__init__":  # a package wins over a module of its name
             sources.append(f"{folder}.py")
         for source in filter(there.__contains__, sources):
             message = f"machine code that runs in place of {source}"
@@ -254,13 +254,13 @@ def _card_names_a_licence(root: Path) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Static:
-    """What was read; nothing of it ran.
+    """The result of reading a repository; none of its code ran.
 
     Attributes:
-        entries: The arguments of each ``make_env`` at the top of the entry file, and its line.
-        imports: What the entry file leads to and the repository does not have, by name.
-        declared: What it declares; None where it says nothing, or nothing that can be taken.
-        findings: What is worth a look.
+        entries: The arguments and the line of each ``make_env`` at the top of the entry file.
+        imports: Imports that the entry file leads to and the repository lacks, by name.
+        declared: Its declared packages; None if it declares none, or none that are supported.
+        findings: Suspicious contents.
     """
 
     snapshot: Snapshot
@@ -272,16 +272,16 @@ class Static:
 
     @property
     def reference(self) -> str:
-        """What was read, pinned."""
+        """Returns the pinned reference."""
         return self.snapshot.reference
 
     @property
     def modules(self) -> dict[str, Import]:
-        """Each module that is imported, with the first place."""
+        """Returns each imported module, with its first import."""
         return {statement.name: statement for statement in reversed(self.imports)}
 
     def is_brought(self, module: str) -> bool:
-        """Whether a package of a module's name is declared, or in every sandbox.
+        """Tells whether a package of a module's name is declared, or in every sandbox.
 
         Some packages have another name than their modules.
         """
@@ -294,7 +294,7 @@ class Static:
 
 
 def static(snapshot: Snapshot) -> Static:
-    """Read a repository."""
+    """Reads a repository without running it."""
     parsed = parsing.read(snapshot)
     surveyed = survey(snapshot, parsed)
     entry = parsed.get(snapshot.path)
@@ -319,7 +319,7 @@ def _printable(finding: Finding) -> Finding:
 
 
 def document(read: Static) -> dict[str, Any]:
-    """All of it, as plain data."""
+    """Returns the result as plain data."""
     says = read.declared
     return {
         "reference": read.reference,
@@ -352,12 +352,12 @@ def undeclared(
     packages: Path | None,
     taken: Mapping[str, str] = MappingProxyType({}),
 ) -> list[Finding]:
-    """The imports that nothing declared brings along.
+    """Finds imports that no declared package brings.
 
     Args:
-        stated: What the repository declares, by canonical name.
-        packages: The environment that was made of it; None where this interpreter serves.
-        taken: Modules that were installed although nothing declares them, and what needs them.
+        stated: The repository's declared requirements, by canonical name.
+        packages: The environment made from them; None if this interpreter serves.
+        taken: Modules installed although undeclared, and the packages that need them.
     """
     brought = _of_this_interpreter({} if packages else stated)
     if packages:
@@ -384,7 +384,7 @@ def _of_this_interpreter(declared: Mapping[str, Requirement]) -> set[str]:
 
 
 def _modules(found: metadata.Distribution) -> set[str]:
-    """What a distribution lets one import; Python 3.10 itself overlooks some of it."""
+    """Returns the modules of a distribution; Python 3.10's own function misses some."""
     named = (found.read_text("top_level.txt") or "").split()
     tops = {file.parts[0] for file in found.files or () if file.suffix in (".py", ".so")}
     return {*named, *(top.partition(".")[0] for top in tops)}

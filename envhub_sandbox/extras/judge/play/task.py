@@ -1,4 +1,4 @@
-"""The questions to one environment of a repository, which is played for them."""
+"""Judges one environment of a repository by playing it."""
 
 from __future__ import annotations
 
@@ -26,33 +26,33 @@ from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.text import printable, size_text
 
 _PICTURED = 12
-"""Tasks of which a page has pictures: a suite may have hundreds."""
+"""Tasks that a page shows with pictures: a suite may have hundreds."""
 _SAMPLES = 10
 _MODES = ("NextStep", "SameStep", "Disabled")
 _RESET = 5
-"""How many slow steps a reset may take."""
+"""The limit of a reset's time, in slow steps."""
 _LARGE_INFO = 512 << 10
-"""Bytes of info a step, for each sub-environment: more than a picture of 480 x 360."""
+"""Bytes of info per step and sub-environment: more than a picture of 480 x 360."""
 _UNSEEDED = 8
-"""Resets without a seed that must not all begin the same episode."""
+"""Resets without a seed, which must not all begin the same episode."""
 _EPISODE_S = 30.0
-"""How long is looked for the end of an episode."""
+"""Seconds to search for the end of an episode."""
 _BEGUN = 4
-"""Steps after each of the resets after which is counted what is left."""
+"""Steps after each reset, before resources are counted."""
 _STATISTICS = ("obs_rms", "return_rms")
-"""What Gymnasium's NormalizeObservation and NormalizeReward learn of all episodes."""
+"""The running statistics of Gymnasium's NormalizeObservation and NormalizeReward."""
 _ALONE = 5
-"""Steps of one sub-environment by itself."""
+"""Steps of a single sub-environment."""
 
 
 class TaskJudge:
-    """Asks one environment every question about how it runs.
+    """Checks everything about how one environment runs.
 
     Args:
-        asked, report: What is judged, and how; what is found.
-        make: Makes all environments once more, in fresh processes, with these arguments changed.
-        env: The environment, whose system calls may be recorded.
-        takes_render_mode: Whether ``make_env`` has such an argument.
+        asked, report: The settings of the judgement; the report that receives findings.
+        make: Makes all environments again, in new processes, with changed arguments.
+        env: The environment; its jail may record system calls.
+        takes_render_mode: Whether ``make_env`` takes this argument.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class TaskJudge:
         self._pictured = asked.pictures and len(report.plays) <= _PICTURED
 
     def ask(self) -> None:
-        """Everything; what its jail was refused is kept, for an error may end the jail too."""
+        """Make all checks; keep the jail's denials, since an error may end the jail too."""
         try:
             self._ask()
         except EnvHubError as error:
@@ -83,7 +83,7 @@ class TaskJudge:
             raise
 
     def _ask(self) -> None:
-        """In the order in which one fault is kept apart from what it causes."""
+        """Make the checks in an order that separates a fault from its consequences."""
         mode = getattr(self._env.metadata.get("autoreset_mode"), "value", None)
         stated = mode in _MODES
         self._holds("autoreset-stated", stated, "the metadata does not say")
@@ -110,22 +110,22 @@ class TaskJudge:
         self._leaks()
 
     def _converted(self) -> None:
-        """Raise it where the sandbox has converted what Gymnasium cannot call."""
+        """Raise the sandbox's note if it converted an environment that Gymnasium cannot call."""
         if isinstance(self._env, SandboxVectorEnv):
             try:
                 told = self._env.get_attr(CONVERTED)
-            except RemoteEnvError:  # as it should be
+            except RemoteEnvError:  # the normal case: nothing was converted
                 return
-            if isinstance(told[0], str):  # a class of its own may have a value for every name
+            if isinstance(told[0], str):  # a custom class may have a value for every name
                 raise RemoteEnvError("TypeError", told[0])
 
     def denied(self) -> tuple[str, ...] | None:
-        """What was refused so far: also where it ended in an error."""
+        """Returns the denials so far, also after an error."""
         denied = None if self._sandbox is None else self._sandbox.denials()
         return self._denied if denied is None else denied
 
     def film(self) -> None:
-        """Last of all, so that no verdict depends on whether somebody looks."""
+        """Film the environment last, so that no verdict depends on the pictures."""
         findings = self._report.findings
         dead = ("survives", self._name) in {(finding.id, finding.task) for finding in findings}
         if self._pictured and not dead and self._env.render_mode == "rgb_array":
@@ -146,17 +146,17 @@ class TaskJudge:
         large = f"half of the steps have infos of {size_text(half)} a sub-environment, or more"
         self._holds("large-infos", half < _LARGE_INFO, large)
 
-    # --- in fresh processes --------------------------------------------------------------------
+    # --- in new processes ----------------------------------------------------------------------
 
     def _of(self, suites: EnvSuites) -> Env:
-        """The one of these names. Raises ``LoadError``: its make_env has others each time."""
+        """Returns this task's environment. Raises ``LoadError``: make_env now has other names."""
         found: Mapping[Any, Env] = suites.get(self._suite, {})
         if self._task not in found:
             raise LoadError(f"there is no {self._name} any more")
         return found[self._task]
 
     def _compare(self, first: Trace, mode: str | None) -> None:
-        """In another process, in the same one again, and spread over two."""
+        """Compare plays: in another process, again in the same process, and over two processes."""
         self._tell("the same play in another process")
         with self._make(num_workers=1) as suites:
             env = self._of(suites)
@@ -172,7 +172,7 @@ class TaskJudge:
             self._same("workers", first, spread, "with one worker and with two")
 
     def _same(self, check: str, trace: Trace, other: Trace, where: str) -> bool:
-        """Judge whether two plays are the same, and return whether they are not."""
+        """Judges whether two plays are the same; returns whether they differ."""
         at = trace.differs_from(other)
         if at is None:
             self._say(check, [])
@@ -197,7 +197,7 @@ class TaskJudge:
         self._holds("slow-steps", half <= most, slow)
 
     def _replay(self, env: Env, mode: str | None, before: Trace) -> None:
-        """In one process: the same seed, another, none; other actions; and on to an end."""
+        """Play again in one process: same seed, another, none; other actions; and until an end."""
         seed, learning = self._asked.seed, self._learning(env)
         if learning is not None:
             before = self._played(env, mode)
@@ -226,10 +226,10 @@ class TaskJudge:
             self._endless(env)
 
     def _learning(self, env: Env) -> int | None:
-        """Stop Gymnasium's running statistics. Returns how many still learn; None if it has none.
+        """Stops Gymnasium's running statistics. Returns how many still learn; None if it has none.
 
         They outlive each reset by design, so they are stopped while plays are compared. Of nested
-        wrappers only the outermost can be stopped from here.
+        wrappers this process can stop only the outermost.
         """
         learning = sum(probes.is_statistics(env, name) for name in _STATISTICS)
         if learning and probes.has(env, "update_running_mean"):  # older releases lack it
@@ -238,7 +238,7 @@ class TaskJudge:
         return learning or None
 
     def _endless(self, env: Env) -> None:
-        """Look for an end of an episode; where there is no time, for a limit that is stated."""
+        """Search for the end of an episode; if the time runs out, for a declared limit."""
         most, limit = self._asked.episode_steps, probes.step_limit(env)
         ended, played = self._ends(env, most, time.monotonic() + _EPISODE_S)
         text = f"no episode ended in {played:,} steps"
@@ -260,9 +260,9 @@ class TaskJudge:
         self._holds("seed-fixed", not is_fixed, same)
 
     def _begun(self, env: Env, most: int) -> Trace:
-        """The episodes that follow a seeded one, up to one that differs.
+        """Plays the episodes after a seeded one, until one differs.
 
-        Followed: ``check_reset_seed_determinism`` of Gymnasium's ``check_env``.
+        The check follows ``check_reset_seed_determinism`` of Gymnasium's ``check_env``.
         """
         env.reset(seed=self._asked.seed)
         begun = Trace()
@@ -278,7 +278,7 @@ class TaskJudge:
                 yield f"{different} steps with other actions give the same results"
 
     def _ends(self, env: Env, steps: int, until: float = math.inf) -> tuple[bool, int]:
-        """Whether an episode ends within so many steps, and the number of steps that were made."""
+        """Tells whether an episode ends within ``steps``, and how many steps were made."""
         env.reset(seed=self._asked.seed)
         for played in range(1, steps + 1):
             _, _, terminations, truncations, _ = env.step(env.action_space.sample())
@@ -288,7 +288,7 @@ class TaskJudge:
                 return False, played
         return False, steps
 
-    # --- in the process that was played first --------------------------------------------------
+    # --- in the process of the first play ------------------------------------------------------
 
     def _leaks(self) -> None:
         if self._sandbox is None or not self._asked.resets:
@@ -297,7 +297,7 @@ class TaskJudge:
         begin = partial(self._ends, self._env, steps)
         seen = probes.usage_per_round(begin, self._used, resets, self._tell)
         if not seen:
-            return  # a server on another host that does not count
+            return  # a server on another host that counts nothing
         self._report.figures[self._name] |= {name: float(n) for name, n in seen[-1].items()}
         grown, words = probes.leak(seen, resets) or ("", "")
         for check in probes.LEAK_CHECKS:
@@ -308,7 +308,7 @@ class TaskJudge:
         return self._play.count(self._sandbox.usage())
 
     def _sample(self, number: int) -> None:
-        """Count after some of the steps: a server counts only so often (``CountLimit``)."""
+        """Count after some of the steps: a server limits how often it counts (``CountLimit``)."""
         if number % -(-self._asked.steps // _SAMPLES) == 0:
             self._used()
             self._play.played = len(self._play.memory)
@@ -320,14 +320,14 @@ class TaskJudge:
             self._report.raised("render", error, self._name)
         else:
             self._say("render", wrong)
-        # LeRobot's evaluation reads the number, and so does Gymnasium's RecordVideo
+        # LeRobot's evaluation and Gymnasium's RecordVideo read this number
         fps = self._env.metadata.get("render_fps")
         is_rate = isinstance(fps, (int, float)) and not isinstance(fps, bool) and fps > 0
         holds = is_rate or self._env.render_mode not in probes.FILMED
         self._holds("render-fps", holds, f"metadata['render_fps'] is {printable(repr(fps), 100)}")
 
     def _renders(self) -> Iterator[str]:
-        """In its own mode; in the others that it declares, where its make_env takes one."""
+        """Yields render's faults: in the current mode, and in other modes if make_env takes one."""
         yield from probes.wrong_frames(self._env)
         given = self._asked.arguments.get("env_kwargs") or {}
         for mode in probes.other_modes(self._env) if self._takes_render_mode else ():
@@ -340,11 +340,11 @@ class TaskJudge:
                 yield from probes.wrong_frames(env)
 
     def _alone(self) -> None:
-        """What one sub-environment gives before Gymnasium writes it into a batch."""
+        """Check the results of one sub-environment before Gymnasium writes them into a batch."""
         uncast: list[str] = []
         types: list[str] = []
         handles = getattr(self._env, "envs", None)
-        # one that has none of its own that can be driven says so by one of these
+        # a vector class without sub-environments that can be stepped raises one of these
         with contextlib.suppress(AttributeError, TypeError, ValueError, NotImplementedError):
             if handles:
                 self._drive(handles[0], uncast, types)
@@ -362,14 +362,14 @@ class TaskJudge:
 
     def _outside(self, observation: Any) -> Iterator[str]:
         space = self._env.single_observation_space
-        with contextlib.suppress(CustomSpaceError):  # whose code is not here to be asked
+        with contextlib.suppress(CustomSpaceError):  # the space's code is not in this process
             if _would_be_cast(observation, space) or not space.contains(observation):
                 given = batches.shown(observation)
                 yield f"sub-environment 0 gave {given}, which is not in {space}"
 
 
 def _would_be_cast(value: Any, space: spaces.Space[Any]) -> bool:
-    """Whether a Box would make an array of it to look whether it is a member."""
+    """Tells whether a Box's membership test would cast the value to an array first."""
     if isinstance(space, spaces.Dict) and isinstance(value, Mapping):
         return any(_would_be_cast(value[name], space[name]) for name in space if name in value)
     if isinstance(space, spaces.Tuple) and isinstance(value, tuple):
@@ -378,7 +378,7 @@ def _would_be_cast(value: Any, space: spaces.Space[Any]) -> bool:
 
 
 def _untyped(reward: Any, terminated: Any, truncated: Any, info: Any) -> Iterator[str]:
-    """What Gymnasium's ``check_env`` refuses of a step. Trust: input from the worker."""
+    """Yields the faults that Gymnasium's ``check_env`` refuses. Trust: input from the worker."""
     is_vector = isinstance(reward, np.ndarray) and reward.size > 1  # as mo-gymnasium's
     if not is_vector and not isinstance(reward, (int, float, np.integer, np.floating)):
         yield f"the reward is {batches.shown(reward)}, not a number"
@@ -390,7 +390,7 @@ def _untyped(reward: Any, terminated: Any, truncated: Any, info: Any) -> Iterato
 
 
 def _can_be_guessed(space: spaces.Space[Any]) -> bool:
-    """Whether actions by lot do something; a word by lot means nothing to whom it is said."""
+    """Tells whether random actions have an effect: a random text has no meaning."""
     if isinstance(space, spaces.Dict):
         return all(map(_can_be_guessed, space.values()))
     if isinstance(space, spaces.Tuple):

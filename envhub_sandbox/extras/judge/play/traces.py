@@ -1,7 +1,7 @@
 """Plays an environment with seeded actions and keeps a trace: a digest of each step, to compare.
 
-What a step returns is looked at meanwhile: members of the observation space, shapes of masks,
-numbers that are not finite, times."""
+The play also checks each step's results: members of the observation space, shapes of masks, finite
+numbers, times."""
 
 from __future__ import annotations
 
@@ -27,27 +27,26 @@ Env = VectorEnv[Any, Any, Any]
 _NOTED, _LONGEST = 3, 200
 _LAST = ("final_obs", "final_observation")
 _KEPT_BYTES, _PART_BYTES = 32 << 20, 400
-"""Of results that are kept: in all, and what Python takes beside the values of each part."""
+"""Bytes of results to keep in all, and Python's overhead for each part of a result."""
 _MOST_ENDS = 1000
 _PARTS = ("the observation", "the reward", "terminated", "truncated")
 
 
 @dataclass
 class Trace:
-    """What a play gave.
+    """The record of a play.
 
     Attributes:
         steps: A digest of the reset, and of every step.
         actions: A digest of the actions of every step.
-        notes: What was seen that no step should have, the first few for each check.
-        heavy: Bytes of the infos of each step, for each sub-environment.
+        notes: The first few faults of steps, for each check.
+        heavy: Bytes of the infos of each step, per sub-environment.
         episodes: How many ended.
         times: Seconds of the reset and of steps, for the report.
-        counted: The episodes that ended, to be looked at; fewer, where its rewards are such that
-            they cannot be counted.
+        counted: The details of ended episodes; fewer if a reward cannot be counted.
         spent: Seconds of each step.
-        ends: Keys of the infos of steps that ended an episode: short ones, and not all of many.
-        results: What the reset and each step returned, without infos, up to a size in all.
+        ends: Short keys of infos at the ends of episodes, up to a number.
+        results: The results of the reset and of each step, without infos, up to a size in all.
     """
 
     steps: list[str] = field(default_factory=list)
@@ -63,7 +62,7 @@ class Trace:
     _left: int = _KEPT_BYTES
 
     def add(self, result: Sequence[Any], resumed: str = "") -> None:
-        """Take a reset's observations, or also what else a step returned."""
+        """Add a reset's observations or a step's results."""
         self.steps.append(resumed + digest(result[0] if len(result) == 1 else tuple(result)))
         parts = dict(itertools.chain.from_iterable(map(_named, _PARTS, result)))
         self._left -= sum(_PART_BYTES + len(name) + _weight(part) for name, part in parts.items())
@@ -71,17 +70,17 @@ class Trace:
             self.results.append({name: copy(value) for name, value in parts.items()})
 
     def note(self, check: str, text: str) -> None:
-        """Keep what was seen, if there is not enough of it for the check."""
+        """Keep a fault, unless the check already has enough."""
         if len(self.notes[check]) < _NOTED:
             self.notes[check].append(text)
 
     def differs_from(self, other: Trace) -> int | None:
-        """The first step of both that differs, 0 for the reset; None if none does."""
+        """Returns the first step that differs, 0 for the reset; None if none does."""
         pairs = enumerate(zip(self.steps, other.steps, strict=False))
         return next((number for number, (mine, theirs) in pairs if mine != theirs), None)
 
     def difference(self, other: Trace, at: int) -> str:
-        """``": "`` and what differs in the results of a step; empty if either has not kept them."""
+        """Returns ``": "`` and the difference at a step; empty if a trace lacks its results."""
         kept = at < min(len(self.results), len(other.results))
         seen = differing(self.results[at], other.results[at]) if kept else ""
         return f": {seen}" if seen else ""
@@ -97,15 +96,15 @@ def play(
     like: Trace | None = None,
     observe: Callable[[int], None] = lambda number: None,
 ) -> Trace:
-    """Reset and step with seeded random actions.
+    """Resets and steps with seeded random actions; returns the trace.
 
     Args:
-        seed: Of the environment, and of the actions unless ``actions_seed`` is given.
-        like: Stop at the first step that differs from this one.
-        observe: Called with the number of each step that was made; 0 is the reset.
+        seed: The environment's seed, and that of the actions unless ``actions_seed`` is set.
+        like: A trace; the play stops at the first step that differs from it.
+        observe: Called with the number of each finished step; 0 is the reset.
 
     Raises:
-        OutsideSpaceError: An observation is no member of its space.
+        OutsideSpaceError: An observation is outside its space.
     """
     counter, counts = EpisodeCounter(env.num_envs, env.num_envs * steps, mode), True
     trace, ended = Trace(counted=counter.counted), np.zeros(env.num_envs, np.bool_)
@@ -189,9 +188,9 @@ def _look_at(trace: Trace, observations: Any, where: str) -> None:
 
 
 def _leaves(value: Any, without: Collection[str] = ()) -> Iterator[Any]:
-    """What stands in mappings, sequences and arrays of objects.
+    """Yields the values inside mappings, sequences and object arrays.
 
-    Trust: input from the worker, already decoded, and so bounded in depth and size.
+    Trust: input from the worker; decoding has bounded its depth and size.
     """
     if isinstance(value, Mapping):
         value = [value[name] for name in value if name not in without]
@@ -205,7 +204,7 @@ def _leaves(value: Any, without: Collection[str] = ()) -> Iterator[Any]:
 
 
 def _foreign(infos: Mapping[Any, Any]) -> Iterator[str]:
-    """A text for each value in infos that crossed as a description only."""
+    """Yields a text for each value in infos that the worker could only describe."""
     for name, value in infos.items():
         for leaf in _leaves(value, _LAST) if name not in _LAST else ():
             if isinstance(leaf, RemoteObject):
@@ -218,7 +217,7 @@ def _texts(infos: Any) -> set[str]:
 
 
 def _named(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """The leaves of a result, each with its name: how long keys are is the worker's choice."""
+    """Yields a result's leaves with their names, cut: the worker chooses the length of keys."""
     if isinstance(value, Mapping):
         for key in value:
             yield from _named(f"{name}[{key!r}]"[:_LONGEST], value[key])
@@ -230,7 +229,7 @@ def _named(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
-    """The first part of two results that differs, in words. Trust: the worker's values."""
+    """Returns the first difference of two results in words. Trust: the worker's values."""
     for name, value in one.items():
         another = other.get(name)
         if digest(value) != digest(another):
@@ -239,7 +238,7 @@ def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
 
 
 def _values(one: Any, other: Any) -> str:
-    """The first of two arrays' values that differs, with its row; else the two, in short."""
+    """Returns the first difference of two arrays, with its row; else both values in short."""
     arrays = isinstance(one, np.ndarray) and isinstance(other, np.ndarray)
     if arrays and one.ndim and one.shape == other.shape and one.dtype == other.dtype != object:
         same = (one == other) | ((one != one) & (other != other))
@@ -250,7 +249,7 @@ def _values(one: Any, other: Any) -> str:
 
 
 def _unbounded(observations: Any) -> Iterator[str]:
-    """What is not finite in observations."""
+    """Yields the non-finite values in observations."""
     for leaf in _leaves(observations):
         value = on_cpu(leaf)
         if isinstance(value, (float, np.ndarray, np.generic)):
@@ -260,7 +259,7 @@ def _unbounded(observations: Any) -> Iterator[str]:
 
 
 def _bytes_of(infos: Any) -> int:
-    """What infos weigh, roughly; without the last observation of an episode."""
+    """Returns the approximate size of infos, without the last observation of an episode."""
     return sum(map(_weight, _leaves(infos, _LAST)))
 
 
@@ -271,7 +270,7 @@ def _weight(leaf: Any) -> int:
 
 
 def _masks(infos: Mapping[Any, Any], count: int) -> Iterator[str]:
-    """What is wrong of infos with masks; one without is about all of them. Trust: the worker's."""
+    """Yields faults of masks in infos; a value without a mask is about all. Trust: the worker's."""
     for name, mask in infos.items():
         value = infos.get(name[1:]) if isinstance(name, str) and name.startswith("_") else None
         if value is None or not isinstance(mask, np.ndarray):
@@ -285,7 +284,7 @@ def _masks(infos: Mapping[Any, Any], count: int) -> Iterator[str]:
 
 
 def digest(value: Any) -> str:
-    """Equal for what is equal bit for bit: arrays, numbers, texts, and what holds them."""
+    """Returns equal digests for values that are equal bit for bit: arrays, numbers, containers."""
     hashed = hashlib.sha256()
     _feed(hashed, value)
     return hashed.hexdigest()
