@@ -1,1 +1,1 @@
-"""Snapshots of git, of the index and of assets; checkouts; Python source that is only read."""
+"""Fetches snapshots from git and indexes, and assets; reads checkouts and Python source as data."""

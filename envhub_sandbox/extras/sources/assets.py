@@ -1,9 +1,9 @@
-"""Further repositories of the Hub that a jail may read: those of ``assets=`` and of the card.
+"""Fetches further Hub repositories that a jail may read: those of ``assets=`` and of the card.
 
-They are fetched and verified as an environment's own files are. The caller's may be private; what
-the author's card declares, or a lock names, is had without a login, also from the store: neither
-must bring the caller's private data into a jail. A card names full commits only. It declares them
-in the ``envhub:`` mapping of the YAML in front of README.md::
+They are fetched and verified like an environment's own files. The caller's may be private. Those of
+the author's card or of a lock are read without a login, also from the store: neither may bring the
+caller's private data into a jail. A card names full commits only. It declares them in the
+``envhub:`` mapping of the YAML in front of README.md::
 
     ---
     envhub:
@@ -12,8 +12,8 @@ in the ``envhub:`` mapping of the YAML in front of README.md::
         - datasets/org/scenes@89abcdef0123456789abcdef0123456789abcdef
     ---
 
-The card is a stranger's: it is read up to ``_MAX_BYTES`` as a tree of nodes, of which nothing is
-constructed, and anchors and merges are not followed.
+Trust: the card is a stranger's. Up to ``_MAX_BYTES`` of it are read as a tree of nodes, without
+constructing objects and without following anchors and merges.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ _FRONT = re.compile(r"\A\ufeff?---[ \t]*\r?\n(.*?)^---[ \t]*\r?$", re.DOTALL | r
 
 
 class CardError(ValueError):
-    """The card declares something that cannot be read; its text says what."""
+    """The card has an unreadable declaration; the text names it."""
 
 
 def declared_assets(root: Path) -> list[str]:
-    """The repositories that a card declares as assets, as it writes them; or ``CardError``."""
+    """Returns the repositories that a card declares as assets, as written; or ``CardError``."""
     try:
         with (root / CARD).open("rb") as file:
             text = file.read(_MAX_BYTES).decode("utf-8", "replace")
@@ -79,7 +79,7 @@ def _tree(text: str) -> Any:
 
 
 def _value(node: Any, key: str) -> Any:
-    """What a mapping has under a key; None where it is no mapping or has no such key."""
+    """Returns a mapping's value for a key; None for another node or a missing key."""
     if getattr(node, "id", "") != "mapping":
         return None
     return next((value for name, value in node.value if name.value == key), None)
@@ -88,14 +88,14 @@ def _value(node: Any, key: str) -> Any:
 def with_assets(
     snapshot: Snapshot, given: Sequence[str], hub: Mapping[str, Any], locked: Sequence[str] = ()
 ) -> Snapshot:
-    """The snapshot with its assets, fetched and verified.
+    """Returns the snapshot with its assets, fetched and verified.
 
     Args:
-        given: The caller's references, or else those of a lock (``locked``); they replace the
-            card's of the same repository.
-        hub: What ``fetch`` takes.
+        given: The caller's references, or else those of a lock (``locked``). A reference replaces
+            the card's for the same repository.
+        hub: Arguments for ``fetch``.
 
-    Raises as that, and for a card that cannot be read, and for what is no asset.
+    Raises as ``fetch``, and for an unreadable card or a reference that is no asset.
     """
     where = option_name("assets") if given else "the lock"
     wanted = [_asset(text, snapshot, where) for text in given or locked]
@@ -160,7 +160,7 @@ def _asset(text: str, snapshot: Snapshot, where: str) -> HubRef:
             f"{snapshot.label}: {where} holds {shown}, which names a file; an asset is a whole "
             "repository, as in 'org/data@COMMIT'"
         )
-    if ref.repo_type not in (None, *REPO_TYPES):  # a card would choose the host that is asked
+    if ref.repo_type not in (None, *REPO_TYPES):  # else a card would choose the host to contact
         raise elsewhere
     if _may_be(ref, snapshot.repo_type, snapshot.repo_id.casefold()):
         raise HubReferenceError(

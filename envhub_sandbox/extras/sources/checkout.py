@@ -1,10 +1,10 @@
-"""What git would commit of a folder, asked of git without obeying the checkout.
+"""Asks git which files of a folder it would commit, without obeying the checkout.
 
-A checkout may be a stranger's. Its ``.git`` names programs that git runs (``core.fsmonitor``,
-filters, hooks), the folder that git looks at (``core.worktree``), and where git fetches missing
-objects from. So git gets a repository folder of our own, ``folder``, with no such settings. Of
-the checkout's it reads data alone: the index, the objects and ``info/exclude``; and in the folder
-``.gitignore`` and ``.gitattributes``. The caller's own settings hold, as for any ``git``.
+Trust: a checkout may be a stranger's. Its ``.git`` names programs for git (``core.fsmonitor``,
+filters, hooks), the folder that git examines (``core.worktree``), and sources of missing objects.
+So git gets our own repository folder, ``folder``, without these settings. From the checkout it
+reads only data: the index, the objects and ``info/exclude``; and from the folder ``.gitignore``
+and ``.gitattributes``. The caller's own settings apply, as for any ``git``.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from envhub_sandbox.system.platform import user_id
 from envhub_worker.protocol.records import dataclass
 
 TIMEOUT_S = 20.0
-"""For git: a hostile pattern in ``.gitignore`` can take for ever."""
+"""The time limit of git: a hostile pattern in ``.gitignore`` can take for ever."""
 _MOST_BYTES = 64 << 10
-"""Of a file that is read here rather than by git."""
+"""The largest file that this module reads itself."""
 _GIT_FOLDER = Path(__file__).with_name("git_folder")
 _SETTINGS = ("core.fsmonitor=false", "core.untrackedCache=false", f"core.hooksPath={os.devnull}")
 _KEPT = ("GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM", "GIT_CONFIG_NOSYSTEM")
 _LIST = ("ls-files", "-z", "-v", "--cached", "--others", "--exclude-standard")
 _CONVERSIONS = ("filter", "ident", "working-tree-encoding")
-"""Attributes by which a folder has other bytes than the commit; ends of lines aside."""
+"""Attributes that make a folder's bytes differ from the commit's, apart from line ends."""
 _SHA256 = r"(?im)^\s*objectformat\s*=\s*\"?sha256"
-"""In a configuration; such an index reads as another one here, and git does not notice."""
+"""In a configuration; git here would misread such an index without noticing."""
 
 
 class _Repository(NamedTuple):
-    """Where a checkout begins, its git folder, and the one that it shares with its worktrees."""
+    """A checkout's top folder, its git folder, and the git folder that its worktrees share."""
 
     top: Path
     own: Path
@@ -48,14 +48,14 @@ class _Repository(NamedTuple):
 
 @dataclass(frozen=True)
 class Checkout:
-    """A folder that lies in a git checkout.
+    """A folder in a git checkout.
 
     Attributes:
-        files: What a commit of everything would hold of it, relative to it; among them folders
-            that are repositories of their own, of which it would hold a pointer.
+        files: The paths that a commit of everything would contain, relative to the folder; for a
+            nested repository the path of its folder, since the commit contains a pointer to it.
         folders: Every folder above these.
-        untracked: The files of which it would be the first commit.
-        held_back: Files of which a commit has git's own version, whatever lies in the folder
+        untracked: The files that git does not know yet.
+        held_back: Files whose own version git commits, whatever the folder contains
             (skip-worktree, assume-unchanged).
     """
 
@@ -68,15 +68,15 @@ class Checkout:
 
     @cached_property
     def tracked(self) -> frozenset[str]:
-        """The files that git knows already."""
+        """Returns the files that git knows already."""
         return self.files - self.untracked
 
     def tracks_below(self, folder: str) -> bool:
-        """Whether git knows a file in a folder."""
+        """Tells whether git knows a file below a folder."""
         return any(name.startswith(f"{folder}/") for name in self.tracked)
 
     def names_in(self, folder: str) -> frozenset[str]:
-        """What the files in a folder are called."""
+        """Returns the names of the files in a folder."""
         return self._names.get(folder, frozenset())
 
     @cached_property
@@ -88,11 +88,10 @@ class Checkout:
         return {folder: frozenset(names) for folder, names in names_by_value.items()}
 
     def converted(self, names: Iterable[str]) -> list[tuple[str, str]]:
-        """Which of these files git commits with other bytes, and by which attribute.
+        """Returns the files that git commits with other bytes, each with the responsible attribute.
 
-        ``.gitattributes`` counts as it lies in the folder, and as it lies in the index: by the
-        latter git made the folder, and it may have converted ``.gitattributes``, too. Raises
-        ``SnapshotError`` where git cannot say.
+        Reads ``.gitattributes`` from folder and index: git made the folder by the index's version,
+        and may have converted ``.gitattributes`` too. Raises ``SnapshotError`` if git fails.
         """
         paths = b"".join(os.fsencode(name) + b"\0" for name in names)
         return sorted({*self._attributes(paths), *self._attributes(paths, "--cached")})
@@ -112,18 +111,18 @@ class Checkout:
 
 
 def read_checkout(folder: Path) -> Checkout | None:
-    """What git says of a folder (an absolute path without links); None where it is in no checkout,
-    or git cannot tell. Raises ``SnapshotError`` where a pattern keeps git from it: a commit can
-    have one, and would hide by it what ``converted`` finds.
+    """Asks git about a folder (an absolute path without links); None if it is in no checkout or
+    git fails. Raises ``SnapshotError`` if a pattern makes git too slow: a commit could
+    contain such a pattern to hide the files that ``converted`` finds.
 
-    Git runs no program and writes nothing. A folder that the checkout around it ignores as a whole
-    is in none. A ``.git`` counts only where it belongs to root, to us or to the folder's owner: in
-    ``/tmp`` every user of the machine can make one.
+    Git runs no program and writes nothing. A folder that the surrounding checkout ignores is in no
+    checkout. A ``.git`` counts only if root, this user or the folder's owner owns it: in ``/tmp``
+    every user of the machine can make one.
     """
     repository = _repository_of(folder)
     if repository is None or repository.is_sha256:
         return None
-    # what the checkout's user has git ignore, beside what the commit says
+    # patterns that the checkout's user ignores, beside those of the commit
     exclude = repository.common / "info/exclude"
     excluding = [f"--exclude-from={exclude}"] if exclude.is_file() else []
     output = _git(repository, folder, *_LIST, *excluding)
@@ -139,8 +138,8 @@ def read_checkout(folder: Path) -> Checkout | None:
 
 
 def is_unread(folder: Path) -> bool:
-    """Whether a folder lies in a checkout of which git says nothing: so nobody knows what its
-    commit has. There is no git, it fails, or the object ids are SHA-256.
+    """Tells whether a folder lies in a checkout that git cannot read, so that its commit is
+    unknown: git is missing or fails, or the object ids are SHA-256.
     """
     repository = _repository_of(folder)
     if repository is None:
@@ -149,7 +148,7 @@ def is_unread(folder: Path) -> bool:
 
 
 def make_checkout(folder: Path) -> None:
-    """Run ``git init`` in a folder that is in no checkout, where there is git."""
+    """Run ``git init`` in a folder outside any checkout, if git is installed."""
     program = _program()
     if program is None or read_checkout(folder.resolve()) is not None:
         return
@@ -158,7 +157,7 @@ def make_checkout(folder: Path) -> None:
 
 
 def top_of(folder: Path) -> Path | None:
-    """The folder, or the nearest one above it, that has a ``.git`` of any kind."""
+    """Returns the nearest folder, from this one upwards, that has a ``.git`` of any kind."""
     around = (folder, *folder.parents)
     return next((folder for folder in around if os.path.lexists(folder / ".git")), None)
 
@@ -177,7 +176,7 @@ def _repository_of(folder: Path) -> _Repository | None:
         is_sha256 = re.search(_SHA256, _text_of(common / "config")) is not None
         owners = (folder.stat().st_uid, user_id(), 0)
         is_trusted = (top / ".git").lstat().st_uid in owners
-    except (OSError, ValueError):  # also a path with a null byte
+    except (OSError, ValueError):  # also for a path with a null byte
         return None
     return _Repository(top, own, common, is_sha256) if is_one and is_trusted else None
 
@@ -192,8 +191,8 @@ def _text_of(file: Path) -> str:
 def _git(
     repository: _Repository, folder: Path, *arguments: str, given: bytes = b""
 ) -> bytes | None:
-    """What git says; None where there is no git, or it fails. Raises ``SnapshotError``: it takes
-    too long.
+    """Returns git's output; None if git is missing or fails. Raises ``SnapshotError``: it takes too
+    long.
     """
     program = _program()
     if program is None:
@@ -223,12 +222,12 @@ def _git(
 
 def _program() -> str | None:
     path = shutil.which("git")
-    # with "." on the PATH it could be a file of the folder
+    # with "." on PATH, git could be a file of the folder
     return path if path is not None and os.path.isabs(path) else None
 
 
 def _environment(repository: _Repository | None) -> dict[str, str]:
-    """The caller's variables, without those by which a hook of git's names its repository."""
+    """Returns the caller's variables, without those that a git hook sets to name its repository."""
     kept = (name for name in os.environ if name in _KEPT or not name.startswith("GIT_"))
     ours = {name: os.environ[name] for name in kept}
     if repository is None:

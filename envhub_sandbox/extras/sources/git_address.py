@@ -1,8 +1,8 @@
-"""References to commits of git: ``git+https://host/org/repo[@revision][:path]``.
+"""References to git commits: ``git+https://host/org/repo[@revision][:path]``.
 
-And ``github:org/repo`` for short, or a page of that site.
+Also the short form ``github:org/repo``, or a GitHub page.
 
-``hub.reference`` says how they begin.
+``hub.reference`` knows their prefixes.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ _URL = r"([a-z]+)://([A-Za-z0-9][A-Za-z0-9.-]*(?::\d{1,5})?)(/[A-Za-z0-9_.~/+%-]
 
 
 def is_url(text: str) -> bool:
-    """Whether git may be given it: nothing in it is an option, a login or another protocol."""
+    """Tells whether git may receive a URL: it contains no option, login or other protocol."""
     match = re.fullmatch(_URL, text)
     return match is not None and match[1] in PROTOCOLS
 
 
 def read(text: str) -> Parts:
-    """The parts of a reference, or of what a page of GitHub shows, before they are looked at."""
+    """Splits a reference, or the URL of a GitHub page, into unchecked parts."""
     text = _of_page(text) if text.lower().startswith(_PAGES) else text
     is_short = text.lower().startswith(_GITHUB)
     rest = text.partition(":" if is_short else "+")[2]
@@ -65,7 +65,7 @@ def _of_page(url: str) -> str:
 
 
 def check(parts: Parts) -> None:
-    """Raise ``Wrong`` unless it can be fetched."""
+    """Raise ``Wrong`` unless git can fetch the reference."""
     scheme, _, rest = parts.repo_id.partition("://")
     host, _, repo = rest.partition("/")
     if "@" in host:

@@ -1,8 +1,8 @@
-"""The files of one commit of a git repository, as data; ``GitHost`` has the Hub's interface.
+"""Reads the files of a git commit as data; ``GitHost`` has the Hub's interface.
 
-Git gets no settings but ours: no hooks, no filters, no submodules, no logins, and no protocol but
-https. Nothing is checked out: files are read out of the objects, whose names are hashes of their
-content, so that a full commit names all of them. Snapshots and sources of packages both come by it.
+Git gets only our settings: no hooks, filters, submodules or logins, and no protocol but https.
+Nothing is checked out: this module reads files from git's objects, whose names are hashes of their
+content, so a full commit identifies all of them. Snapshots and packages' sources both use it.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ if sys.platform != "win32":
 
 
 MAX_BYTES = 2 * 2**30
-"""Of a file that git writes: what it fetches, and all files of a commit, unpacked."""
+"""Bytes of a file that git writes: a fetched pack, or all unpacked files of a commit."""
 MAX_FILES = 50_000
 _MAX_ROW_BYTES = 2048
-"""Of a file in git's listing: its names have no limit there, and each repeats those above it."""
+"""Bytes of a row in git's listing: git bounds no path, and each path repeats its folders."""
 TIMEOUT_S = 900.0
-"""For all that git does for one commit."""
+"""The time for all of git's work on one commit."""
 DAY_S = 30.0
-"""For the day of a commit, which is asked for while an error waits to be shown."""
+"""The time for the day of a commit, for which an error message waits."""
 _BLOCK = 1 << 20
 _SAID_BYTES = 1000
 _ROW = re.compile(rb"(\d{6}) (\w+) ([0-9a-f]{40}) +(\d+|-)\t(.+)", re.DOTALL)
@@ -66,19 +66,19 @@ _SETTINGS = (
     *("gc.auto=0", "maintenance.auto=false", "core.askPass=true"),
 )
 _LIMITED = 'ulimit -f "$1" && ulimit -v "$2" && shift 2 && exec "$@"'
-"""What ``sh`` does first: git's own children have the same limits. Windows has none."""
+"""The first commands of ``sh``: git's children inherit the limits. Windows has none."""
 _MEMORY_KIB = 4 * 2**20
 _ALONE = {"GIT_TERMINAL_PROMPT": "0", "GIT_NO_LAZY_FETCH": "1", "GIT_CEILING_DIRECTORIES": "/"}
 
 
 Variables = Mapping[str, str]
-"""Of the user: what of it leads to the network is given to git."""
+"""The user's variables: git receives those for access to the network."""
 
 
 def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
-    """The full commit that a branch or a tag means now; one that is full is not asked for.
+    """Returns the full commit that a branch or a tag names now; sends no query for a full commit.
 
-    Raises ``HubReferenceError`` for a URL or a name that is not taken, and ``HubFailure``.
+    Raises ``HubReferenceError`` for an unsupported URL or name, and ``HubFailure``.
     """
     if is_commit(revision):
         return revision
@@ -91,7 +91,7 @@ def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
         git = _Git(Path(place), variables)
         answer = git.run("ls-remote", "--quiet", _checked(url), *names)
-    rows = answer.decode("utf-8", "replace").splitlines()  # other names may end with these
+    rows = answer.decode("utf-8", "replace").splitlines()  # other names may have the same end
     found = {name: commit for commit, _, name in (row.partition("\t") for row in rows)}
     commit = next((found[name] for name in names if name in found), "")
     if not is_commit(commit):
@@ -102,7 +102,7 @@ def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
 
 @dataclass(frozen=True)
 class GitBlob:
-    """A file of a commit: its path, its name as an object, bytes, and which kind of file it is."""
+    """A file of a commit: its path, the name of its object, its size and its kind."""
 
     path: str
     digest: str
@@ -112,11 +112,11 @@ class GitBlob:
 
 
 class GitFiles:
-    """What a commit holds, as long as it is here.
+    """The content of a commit, while it is on this machine.
 
     Attributes:
-        blobs: Its files, and its links, of which the text is the content.
-        submodules: The paths of those; nothing is fetched for them.
+        blobs: Its files, and its links, whose content is their target.
+        submodules: The paths of submodules, which are not fetched.
     """
 
     def __init__(self, blobs: list[GitBlob], submodules: list[str], content: IO[bytes]) -> None:
@@ -125,18 +125,18 @@ class GitFiles:
         self._content = content
         self._starts: dict[str, int] = {}
         end = 0
-        for blob in blobs:  # each behind the line that ``cat-file --batch`` writes before it
+        for blob in blobs:  # a line of ``cat-file --batch`` precedes each blob
             start = end + len(f"{blob.digest} blob {blob.size}\n")
             self._starts[blob.path] = start
             end = start + blob.size + 1
 
     def open(self, blob: GitBlob) -> IO[bytes]:
-        """A stream of its bytes; one at a time."""
+        """Returns a stream of a blob's bytes; use one stream at a time."""
         return io.BufferedReader(_Part(self._content, self._starts[blob.path], blob.size))
 
 
 class _Part(io.RawIOBase):
-    """Some bytes of a file, by blocks: a stranger chose how many they are."""
+    """A part of a file, read in blocks: a stranger chose its size."""
 
     def __init__(self, file: IO[bytes], start: int, size: int) -> None:
         self._file = file
@@ -156,9 +156,9 @@ class _Part(io.RawIOBase):
 
 @contextmanager
 def fetched(url: str, commit: str, variables: Variables | None = None) -> Iterator[GitFiles]:
-    """The files of a full commit, for as long as the context lasts.
+    """Yields the files of a full commit, valid inside the context.
 
-    Raises as ``resolve``, and ``SnapshotTooLargeError`` or ``SnapshotError`` for what it holds.
+    Raises as ``resolve``, and ``SnapshotTooLargeError`` or ``SnapshotError`` for the content.
     """
     source = _checked(url)
     title = f"{url}@{commit[:12]}"
@@ -181,7 +181,7 @@ def fetched(url: str, commit: str, variables: Variables | None = None) -> Iterat
 
 
 def day_of(url: str, commit: str) -> str:
-    """The day of a full commit, as its author has it: ``"2024-05-31"``. Raises as ``resolve``."""
+    """Returns the author's date of a full commit: ``"2024-05-31"``. Raises as ``resolve``."""
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as folder:
         git = _Git(Path(folder), None, DAY_S)
         git.fetch(_checked(url), commit, "--filter=tree:0")  # without files, where a host can
@@ -189,7 +189,7 @@ def day_of(url: str, commit: str) -> str:
 
 
 def _rows(file: IO[bytes], title: str) -> Iterator[bytes]:
-    """Each file of a tree. Trees that hold each other make billions of a few bytes."""
+    """Yields each file of a tree, bounded: nested trees expand a few bytes to billions of files."""
     left = b""
     count = 0
     while block := file.read(_BLOCK):
@@ -226,7 +226,7 @@ def _checked(url: str) -> str:
 
 
 class _Git:
-    """Git in one folder, within one deadline, with nothing of the user's settings and logins."""
+    """Runs git in one folder, within one deadline, without the user's settings and logins."""
 
     def __init__(
         self, store: Path, variables: Variables | None, timeout_s: float | None = None
@@ -239,15 +239,15 @@ class _Git:
         self._environment = {**_to_the_network(theirs), **ours, **_ALONE}
 
     def fetch(self, source: str, commit: str, *options: str) -> None:
-        """Fetch one commit into the folder, which is a repository from then on."""
+        """Fetch one commit into the folder, which becomes a repository."""
         self.run("init", "--quiet", "--bare", "--template=", ".")
         plain = ("--quiet", "--depth=1", "--no-tags", "--no-recurse-submodules", "--no-auto-gc")
         self.run("fetch", *plain, *options, source, commit)
 
     def run(self, *arguments: str, given: bytes = b"", output: IO[bytes] | None = None) -> bytes:
-        """Run git, and return the first of what it prints, where there is no file for that.
+        """Runs git; returns the beginning of its output, or writes the output to a file.
 
-        It prints into files, for which it has a limit: a pipe would bring all of it into our
+        Git prints into files, whose size the kernel limits: a pipe would bring all of it into our
         memory.
         """
         program = shutil.which("git")
@@ -276,9 +276,9 @@ class _Git:
     def _run_to_its_end(
         self, words: list[str], given: bytes, stdout: IO[bytes], stderr: IO[bytes]
     ) -> None:
-        """Nothing of it is left then, also where it took too long or we are interrupted.
+        """Run a command; leave no process of it, even after a timeout or an interrupt.
 
-        Git's children ask the host, which may keep them for ever.
+        Git's children contact the host, which may never answer them.
         """
         with subprocess.Popen(
             words,
@@ -298,7 +298,7 @@ class _Git:
 
 
 def _limited() -> tuple[str, ...]:
-    """What runs a command in limits: of a file in blocks of 512 bytes, and of memory in KiB."""
+    """Returns a command's prefix for its limits: files in 512-byte blocks, memory in KiB."""
     words: tuple[str, ...] = ()
     if sys.platform != "win32":
         _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -325,17 +325,17 @@ _SHOWN = 10
 
 @dataclass(frozen=True)
 class GitHost:
-    """Scheme and host of an address, in front of the repository's name."""
+    """A git host: ``public_endpoint`` is the scheme and host before the repository's name."""
 
     public_endpoint: str
 
     def resolve(self, repo: Repository, revision: str | None) -> str:
-        """The full commit that a branch or a tag is now; None is ``HEAD``."""
+        """Returns the full commit that a branch or a tag names now; None means ``HEAD``."""
         return resolve(f"{self.public_endpoint}/{repo.repo_id}", revision or "HEAD")
 
     @contextmanager
     def files(self, repo: Repository, commit: str) -> Iterator[CommitFiles]:
-        """The files of a commit. Links are files with their text; submodules are left out."""
+        """Yields a commit's files. A link is a file with its target as text; skips submodules."""
         with fetched(f"{self.public_endpoint}/{repo.repo_id}", commit) as found:
             title = f"{repo.repo_id}@{commit[:12]}"
             if found.submodules:
@@ -351,7 +351,7 @@ class GitHost:
 
 
 def _has_lfs(found: GitFiles) -> bool:
-    """Whether ``.gitattributes`` at its root says so."""
+    """Tells whether the root's ``.gitattributes`` uses LFS."""
     for blob in found.blobs:
         if blob.path == ".gitattributes":
             with found.open(blob) as stream:

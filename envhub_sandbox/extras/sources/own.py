@@ -1,7 +1,7 @@
-"""What of a folder is one file's own: the file, and the modules and packages that it imports.
+"""Finds the files in a folder that belong to one file: itself, and the modules that it imports.
 
-A package is taken whole, with its data; a folder without ``__init__.py`` is nobody's, so of it only
-modules are taken that are imported by name: else a stranger's file had any folder by importing it.
+A package belongs to it as a whole, with its data. A folder without ``__init__.py`` is no package,
+so only its imported modules do: else a stranger's file could claim any folder by an import.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from envhub_sandbox.extras.sources.checkout import Checkout
 _INIT = "__init__.py"
 _MACHINE_CODE = (".so", ".pyd")
 _MOST_ROUNDS = 100
-"""How far imports are followed; each takes a process."""
+"""Rounds in which imports are followed; each round starts a process."""
 
 _MOST_KNOWN = 100
 _KNOWN: dict[bytes, parsing.ParsedFile | None] = {}
 
 Names = Callable[[str], Collection[str]]
-"""The names of the files in a folder, which is written with ``/``."""
+"""Returns the names of the files in a folder, a path with ``/``."""
 
 
 def _names_below(root: Path) -> Names:
-    """Gives the names of the files in a folder below ``root``; no link counts, or is followed."""
+    """Returns a function that lists the files in a folder below ``root``; ignores links."""
 
     @functools.cache
     def names(folder: str) -> Collection[str]:
@@ -47,8 +47,8 @@ def _names_below(root: Path) -> Names:
 
 
 def own_files(root: Path, entry: str, checkout: Checkout | None) -> set[str]:
-    """The paths of a file's own below ``root``; of a package its folder, with a slash at its end.
-    Nothing is imported or run.
+    """Returns the paths below ``root`` that belong to a file; for a package its folder, with a
+    slash at its end. Imports and runs nothing.
     """
     names = _names_below(root) if checkout is None else checkout.names_in
     files, waiting, left = set[str](), {entry}, parsing.MOST_BYTES_IN_ALL
@@ -68,14 +68,14 @@ def own_files(root: Path, entry: str, checkout: Checkout | None) -> set[str]:
             for path in _imported(file, parsed_file, names)
         }
         waiting -= files
-        if not waiting or None in read.values():  # what took too much once is not tried on and on
+        if not waiting or None in read.values():  # no second attempt for a file that cost too much
             break
     return {_package_of(path, names) or path for path in files | waiting}
 
 
 def _read(texts: dict[str, bytes]) -> dict[str, parsing.ParsedFile | None]:
-    """What each text is; one that was read in this process before is not parsed again."""
-    parsed_before = dict(_KNOWN)  # other threads may read files, too
+    """Parses each text, unless this process has parsed it before."""
+    parsed_before = dict(_KNOWN)  # a copy, since other threads may parse files too
     found = parsing.parsed(
         {file: text for file, text in texts.items() if text not in parsed_before}
     )
@@ -98,7 +98,7 @@ def _imported(file: str, read: parsing.ParsedFile, names: Names) -> Iterator[str
 
 
 def _files_of(path: str, names: Names) -> Iterator[str]:
-    """A module's source, and machine code that Python would import in place of it."""
+    """Yields a module's source, and machine code that Python would import in its place."""
     folder, _, name = path.rpartition("/")
     below, begin = f"{folder}/" if folder else "", name.removesuffix("py")
     for other in names(folder):
@@ -107,7 +107,7 @@ def _files_of(path: str, names: Names) -> Iterator[str]:
 
 
 def _packages_around(path: str, names: Names) -> Iterator[str]:
-    """The packages that a file lies in, the innermost first; the folder itself is none."""
+    """Yields the packages around a file, the innermost first; never the root folder."""
     folder = path.rpartition("/")[0]
     while folder:
         if _INIT in names(folder):

@@ -1,10 +1,10 @@
-"""Parses a stranger's Python in a process that may be lost over it.
+"""Parses a stranger's Python in a process that may die of it.
 
-``parsing.py`` runs this file by its path, alone in a fresh interpreter: it imports the standard
-library and nothing else. Stdin has each file behind its length (four bytes, big endian), stdout
-gets one line of JSON for each, in the same order: what it imports, uses and names, or its
-encoding where that is another than UTF-8, nothing of what is no Python, ``null`` of what was too
-much. Names are followed to what that file imports and assigns, and no further.
+``parsing.py`` runs this file by its path, alone in a fresh interpreter; the file imports only the
+standard library. Stdin holds each file after its length (four bytes, big endian). Stdout gets one
+line of JSON for each file, in the same order: its imports, uses and names; or its encoding, if that
+is not UTF-8; an empty object if it is not Python; or ``null`` if it costs too much. Names are
+followed to the file's own imports and assignments, and no further.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ if sys.platform != "win32":
     import resource
 
 MEMORY = 1 << 30
-"""Bytes: Python's parser takes a thousand for each of a hostile text."""
+"""Bytes: Python's parser takes a thousand bytes for each byte of a hostile text."""
 CPU_S = 20.0
-"""For one file; 256 KiB that a person wrote take less than one."""
+"""Seconds for one file; 256 KiB that a person wrote take less than one second."""
 OUTPUT = 64 << 20
 MOST = 10_000
-"""Of each kind, for one file; it is said where there are more."""
+"""Rows of each kind for one file; the answer says if there are more."""
 LONGEST = 1024
-"""Of a module, as a path of a file can be."""
+"""Characters of a module's name: as many as a file's path may have."""
 _LONGEST_TEXT = 200
 _READ_AS = ("utf-8", "utf-8-sig", "ascii")
 _DEEPEST = 8
@@ -43,7 +43,7 @@ _OUTSIDE = re.compile(
     r"_(TOKEN|SECRET|PASSWORD|KEY)[A-Z_]*"
 )
 DRAWN = " drawn"
-"""Behind an id that is made with a ``render_mode``."""
+"""Follows an id that the file makes with a ``render_mode``."""
 _ID = re.compile(r"[A-Za-z0-9_./-]{1,80}-v\d{1,3}")
 _ENTRY_POINT = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)")
 _MISSING = {"BaseException", "Exception", "ImportError", "ModuleNotFoundError"}
@@ -52,17 +52,17 @@ _BY_TEXT = {"getattr", "getattr_static", "__getattribute__"}
 _IMPORTERS = {"__import__", "import_module", "resolve_name", "locate"}
 _SAVING = {"save", "savez", "savez_compressed", "write_array"}
 _MOST_MEANINGS = 16
-"""Of one expression."""
+"""Meanings of one expression."""
 _ROUNDS = 4
-"""Assignments that are followed behind one another, at least."""
+"""The least number of chained assignments that are followed."""
 _WORDLESS = re.compile(r"(?<![A-Za-z0-9+/=_\\-])[A-Za-z0-9+/=_\\-]{1000,}")
 
 
 def bound() -> None:
-    """From here on the kernel ends us, or refuses us memory: as far as there are limits.
+    """Limit this process: the kernel ends it, or refuses it memory, where the platform has limits.
 
-    Where there are none, a file's size bounds what it takes: some 256 MiB for the largest that is
-    read.
+    Elsewhere the size of a file bounds the memory: some 256 MiB for the largest file that is
+    accepted.
     """
     if sys.platform != "win32":
         for what, most in (
@@ -77,27 +77,27 @@ def bound() -> None:
                 resource.setrlimit(what, (least, least))
             except (OSError, ValueError):
                 if sys.platform == "linux":
-                    raise  # macOS takes no limit of memory below what a process has mapped
+                    raise  # macOS refuses a memory limit below the mapped memory
         signal.signal(signal.SIGPROF, signal.SIG_DFL)
 
 
 def begin_file() -> None:
-    """From here on one file has its share of time: of the processor's, or where that is not
-    counted of the clock's.
+    """Limit the time for the next file: CPU time, or the clock's time on a platform that does not
+    count CPU time.
     """
     if sys.platform == "win32":
-        faulthandler.dump_traceback_later(CPU_S, exit=True)  # a thread that waits for no other
+        faulthandler.dump_traceback_later(CPU_S, exit=True)  # its thread needs no other thread
     else:
         signal.setitimer(signal.ITIMER_PROF, CPU_S)
 
 
 def described(data: bytes) -> dict[str, Any] | None:
-    """What a file says; nothing of what is no Python of this version, None of what is too much."""
+    """Returns a file's content; {} if this Python cannot parse it, None if it costs too much."""
     named = encoding(data)
     if named not in _READ_AS:
         return {"encoding": named[:_LONGEST_TEXT]}
     try:
-        # the bytes: what ``import`` compiles; a decoded text can be another program
+        # the bytes, as ``import`` does: the decoded text may be another program
         tree = ast.parse(data)
         rows = _rows(tree)
         whole = all(len(found) <= MOST for found in rows.values())
@@ -109,17 +109,17 @@ def described(data: bytes) -> dict[str, Any] | None:
 
 
 def encoding(data: bytes) -> str:
-    """The encoding by which Python reads a file; empty where it has none that there is.
+    """Returns the encoding by which Python reads a file; empty if there is no such encoding.
 
-    Nothing is decoded by a codec that a stranger's first lines choose: some take hours, and some
-    make code of a comment. Python ends lines at a carriage return, too, before it looks for the
-    encoding, and ``tokenize`` does not.
+    A stranger's first lines must not choose a codec that decodes here: some take hours, and some
+    turn a comment into code. Before Python looks for the encoding, it ends lines at carriage
+    returns too, unlike ``tokenize``.
     """
     lines = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     try:
         named = codecs.lookup(tokenize.detect_encoding(io.BytesIO(lines).readline)[0]).name
         if named in _READ_AS:
-            data.decode("utf-8")  # Python does not mind what else a comment holds
+            data.decode("utf-8")  # Python ignores the other bytes of a comment
     except (SyntaxError, UnicodeDecodeError):
         return ""
     return named
@@ -132,7 +132,7 @@ def _rows(tree: ast.Module) -> dict[str, list[Any]]:
     meanings = _Meanings(nodes)
     uses = {(name, line): None for node in nodes for name, line in meanings.used(node)}
     rows: dict[str, list[Any]] = {kind: [] for kind in ("imports", "texts", "entries", "ids")}
-    rows["uses"] = [[name[-LONGEST:], line] for name, line in uses]  # its end says what it is
+    rows["uses"] = [[name[-LONGEST:], line] for name, line in uses]  # its end identifies a name
     for node in nodes:
         if isinstance(node, (ast.Import, ast.ImportFrom)):
             rows["imports"].append(
@@ -159,7 +159,7 @@ def _rows(tree: ast.Module) -> dict[str, list[Any]]:
 
 
 def _definition_of(statement: ast.stmt) -> str:
-    """The name of a function or class at the top of a file; decorated ones are used at once."""
+    """Returns the name of a top-level function or class; decorated ones count as used."""
     kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
     if isinstance(statement, kinds) and not statement.decorator_list:
         return statement.name[:_LONGEST_TEXT]
@@ -167,7 +167,7 @@ def _definition_of(statement: ast.stmt) -> str:
 
 
 def _places(tree: ast.Module) -> dict[int, str]:
-    """The function or class at the top of the file that a node lies in."""
+    """Returns the top-level function or class around each node."""
     return {
         id(node): name
         for statement in tree.body
@@ -177,7 +177,7 @@ def _places(tree: ast.Module) -> dict[int, str]:
 
 
 def _definitions(tree: ast.Module) -> list[list[Any]]:
-    """Each function and class at the top with the names that it uses; without a name: the rest."""
+    """Lists top-level functions and classes and the names they use; "" stands for other code."""
     definitions: dict[str, dict[str, None]] = {"": {}}
     left = MOST
     for statement in tree.body:
@@ -193,7 +193,7 @@ def _definitions(tree: ast.Module) -> list[list[Any]]:
 
 
 def _imported_by_name(called: list[str], node: ast.Call) -> Iterator[tuple[str, list[str]]]:
-    """``import_module("a.b")``, and ``register(..., entry_point="a.b:C")``."""
+    """Yields the modules of ``import_module("a.b")`` and of ``register(entry_point="a.b:C")``."""
     if "importlib.import_module" in called:
         if (module := _constant(node.args[:1])) and not module.startswith("."):
             yield module[:LONGEST], []
@@ -206,7 +206,7 @@ def _imported_by_name(called: list[str], node: ast.Call) -> Iterator[tuple[str, 
 
 
 def _drawn(node: ast.Call) -> Iterator[str]:
-    """Ids that a call names beside a ``render_mode``."""
+    """Yields the ids in a call that has a ``render_mode``."""
     arguments = {keyword.arg: keyword.value for keyword in node.keywords}
     mode = arguments.get("render_mode")
     if mode is None or (isinstance(mode, ast.Constant) and mode.value is None):
@@ -218,10 +218,10 @@ def _drawn(node: ast.Call) -> Iterator[str]:
 
 
 class _Meanings:
-    """What the expressions of a file may mean, by what it imports and where it assigns that to.
+    """The possible meanings of a file's expressions, by its imports and assignments.
 
-    A name may mean several things, since no scope is followed. What a text names, as in
-    ``getattr(os, "system")`` or ``vars(os)["system"]``, is as if it were written out.
+    A name may have several meanings, since scopes are ignored. A name in a text, as in
+    ``getattr(os, "system")`` or ``vars(os)["system"]``, counts like a written name.
     """
 
     def __init__(self, nodes: list[ast.AST]) -> None:
@@ -256,7 +256,7 @@ class _Meanings:
         return bool(known and name) and _add(self._assigned.setdefault(name, []), known)
 
     def used(self, node: ast.AST) -> list[tuple[str, int]]:
-        """What a node makes use of, dotted, or a builtin; and its line."""
+        """Returns the dotted names or the builtin that a node uses, with its line."""
         line = getattr(node, "lineno", 0)
         return [(name, line) for name in self._used(node)]
 
@@ -276,7 +276,7 @@ class _Meanings:
         return []
 
     def of(self, node: ast.AST | None, left: int = _DEEPEST) -> list[str]:
-        """An expression's meanings; those of a container are its members'."""
+        """Returns an expression's meanings; a container has those of its members."""
         dotted: list[str] = []
         if not left or node is None:
             return ["()"]
@@ -329,7 +329,7 @@ class _Meanings:
         return self._item(owner, text) if name in ("get", "pop") and text else [f"{function}()"]
 
     def _item(self, base: str, key: str) -> list[str]:
-        """What a key may lead to: in a namespace what has that name, else the container itself."""
+        """Returns a key's value in a namespace, by its name; else the container itself."""
         if base in ("globals()", "locals()", "vars()") and key:
             return self._named(key)
         if base == "sys.modules" and key:
@@ -340,7 +340,7 @@ class _Meanings:
 
 
 def _imported(node: ast.Import | ast.ImportFrom) -> list[str]:
-    """The dotted name of each thing that a statement imports, but of the repository's own."""
+    """Returns the dotted names that a statement imports, except the repository's own."""
     names = [alias.name[:_LONGEST_TEXT] for alias in node.names]
     if isinstance(node, ast.Import):
         return names
@@ -349,7 +349,7 @@ def _imported(node: ast.Import | ast.ImportFrom) -> list[str]:
 
 
 def _add(meanings: list[str], further: list[str]) -> bool:
-    """Whether there was one among them that was not known."""
+    """Adds further meanings; tells whether one of them is new and there is room for more."""
     new = [meaning for meaning in dict.fromkeys(further) if meaning not in meanings]
     meanings += new[: max(_MOST_MEANINGS - len(meanings), 0)]
     return bool(new) and len(meanings) < _MOST_MEANINGS
@@ -360,13 +360,13 @@ def _is_dotted(name: str) -> bool:
 
 
 def _constant(nodes: list[ast.expr]) -> str:
-    """A text that is written out, alone; else an empty one."""
+    """Returns the value of a single literal text; else an empty text."""
     value = nodes[0].value if nodes and isinstance(nodes[0], ast.Constant) else None
     return value[:_LONGEST_TEXT] if isinstance(value, str) else ""
 
 
 def _bound_by(node: ast.AST) -> str:
-    """The name that a node gives a value of a file's own."""
+    """Returns the name that a node binds to a value of the file's own."""
     if isinstance(node, ast.Name):
         return "" if isinstance(node.ctx, ast.Load) else node.id
     if isinstance(node, (ast.arg, ast.keyword)):
@@ -375,7 +375,7 @@ def _bound_by(node: ast.AST) -> str:
 
 
 def _assignments(node: ast.AST) -> Iterator[tuple[ast.AST, ast.expr]]:
-    """Each target with its value; a loop's is a member."""
+    """Yields each target with its value; a loop's target is a member of its value."""
     if isinstance(node, ast.Assign):
         for target in node.targets:
             yield from _unpacked(target, node.value)
@@ -408,7 +408,7 @@ def _unpacked(target: ast.expr, value: ast.expr) -> Iterator[tuple[ast.AST, ast.
 
 
 def _arguments(called: list[str], node: ast.Call) -> Iterator[str]:
-    """What makes a call load pickles: an argument, or the lack of one."""
+    """Yields the reasons why a call loads pickles: an argument, or the lack of an argument."""
     arguments = {keyword.arg: keyword.value for keyword in node.keywords}
     if isinstance(several := arguments.pop(None, None), ast.Dict):
         keys = [_constant([key]) if key else "" for key in several.keys]
@@ -427,12 +427,12 @@ def _arguments(called: list[str], node: ast.Call) -> Iterator[str]:
 
 
 def _may_be(node: ast.expr) -> bool:
-    """Whether a value may be true."""
+    """Tells whether a value may be true."""
     return not isinstance(node, ast.Constant) or bool(node.value)
 
 
 def _text(node: ast.Constant) -> list[list[Any]]:
-    """Of texts that name places beyond the repository, or that no person can read."""
+    """Returns a row for a text that names a place outside, or that no person can read."""
     text = str(node.value)
     if len(text) <= _LONGEST_TEXT and _OUTSIDE.fullmatch(text):
         return [["outside", text, len(text), node.lineno]]
@@ -447,8 +447,8 @@ def _import(node: ast.Import | ast.ImportFrom) -> list[Any]:
 
 
 def _required(tree: ast.AST) -> Iterator[ast.AST]:
-    """Every node but those of imports that may fail, or are for other programs."""
-    waiting = [tree]  # no recursion: a stranger chose how deep it is
+    """Yields every node except those of optional imports and of imports for other programs."""
+    waiting = [tree]  # no recursion: a stranger chose the depth
     while waiting:
         node = waiting.pop()
         yield node
@@ -468,7 +468,7 @@ def _needed_below(node: ast.AST) -> list[ast.AST]:
 
 
 def _catches(handler: ast.ExceptHandler) -> bool:
-    """Whether it is where a missing module leads to."""
+    """Tells whether a handler catches the error of a missing module."""
     kinds = handler.type.elts if isinstance(handler.type, ast.Tuple) else [handler.type]
     return any(kind is None or _last(kind) in _MISSING for kind in kinds)
 
@@ -489,7 +489,7 @@ def _suppresses(node: ast.expr) -> bool:
 
 
 def _asks(node: ast.If) -> bool:
-    """``if importlib.util.find_spec("a"):``"""
+    """Tells whether a test calls ``find_spec``: ``if importlib.util.find_spec("a"):``"""
     return any(
         isinstance(child, ast.expr) and _last(child) == "find_spec" for child in ast.walk(node.test)
     )
@@ -500,13 +500,13 @@ def _last(node: ast.expr) -> str:
 
 
 def _is_program(node: ast.AST) -> bool:
-    """``if __name__ == "__main__":``"""
+    """Tells whether a statement is ``if __name__ == "__main__":``"""
     test = node.test if isinstance(node, ast.If) else None
     return isinstance(test, ast.Compare) and _dotted(test.left) == "__name__"
 
 
 def _dotted(node: ast.expr) -> str:
-    """``a.b.c`` as a text; empty for what is no chain of names, or a very long one."""
+    """Returns ``a.b.c`` as a text; empty for other expressions and for very long chains."""
     parts: list[str] = []
     while isinstance(node, ast.Attribute) and len(parts) < _DEEPEST:
         parts.append(node.attr)
@@ -515,9 +515,9 @@ def _dotted(node: ast.expr) -> str:
 
 
 def main() -> None:
-    """Answer for each file; what a file costs beyond its share ends us."""
+    """Answer for each file; a file that exceeds its limits ends this process."""
     bound()
-    warnings.simplefilter("ignore")  # the parser shows a stranger's lines with its own
+    warnings.simplefilter("ignore")  # a warning of the parser's would show a stranger's lines
     while head := sys.stdin.buffer.read(4):
         data = sys.stdin.buffer.read(int.from_bytes(head, "big"))
         begin_file()

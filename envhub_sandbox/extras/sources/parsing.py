@@ -1,10 +1,10 @@
-"""What a snapshot's Python files say and import: each read once, and parsed in a bounded child.
+"""Reads the imports and contents of a snapshot's Python files: each once, in a bounded child.
 
-A text can take hours of Python's parser, gigabytes, or its process. What becomes of the child is
-no matter of ours: the file that ended it is one that cannot be read.
+A hostile text can cost Python's parser hours or gigabytes, or crash it. Then only the child dies,
+and the file counts as unreadable.
 
-Nothing is imported or run. What is found in code is a hint for a person and no wall: who wants to
-hide a call can. The walls are the sandbox's.
+Nothing is imported or run. Findings in code are hints for people: an author can hide a call, and
+only the sandbox protects.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from envhub_sandbox.hub.listing import Snapshot
 from envhub_sandbox.system.platform import open_flags, own_variables
 
 MOST_BYTES = 256 << 10
-"""Of one file."""
+"""Bytes of one file."""
 MOST_BYTES_IN_ALL = 16 << 20
 MOST_LOST = 4
-"""Children; what is left then is not read."""
+"""Children that may die; the remaining files stay unread."""
 _PATIENCE_S = 600.0
-"""For a child that neither computes nor ends, as nothing lets it; the bound is its CPU time."""
+"""Seconds to wait for a child that neither computes nor ends; normally its CPU limit ends it."""
 
 
 class ImportStatement(NamedTuple):
-    """One statement of import.
+    """An import statement.
 
     Attributes:
-        level: Of a relative ``from``; -1 for ``import``.
-        module: Behind ``from``.
-        required: Whether the file does not work without: it is not within a ``try`` that goes on
-            without it, nor for type checkers or for the file as a program.
-        within: The function or class at the top of the file that it stands in; empty for none.
+        level: The level of a relative ``from``; -1 for ``import``.
+        module: The name after ``from``.
+        required: Whether the file fails without the import: it is not in a ``try`` that handles its
+            failure, and not only for type checkers or for the file as a program.
+        within: The top-level function or class around the statement; empty for none.
     """
 
     level: int
@@ -57,20 +57,20 @@ class ImportStatement(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ParsedFile:
-    """What a file says; each with its line at the end. Names are followed to their imports.
+    """The content of a file; each row ends with its line. Names are followed to their imports.
 
     Attributes:
         imports: In the order of a walk.
-        uses: Dotted names, called or not; ``[computed]`` for what is got by a computed name.
-        texts: ``"outside"`` with a text that names a place beyond, or ``"wordless"``; its length.
+        uses: Dotted names, called or not; ``[computed]`` for an attribute with a computed name.
+        texts: ``"outside"`` with a text that names a place outside, or ``"wordless"``; its length.
         entries: The arguments of each ``make_env``.
-        ids: Texts such as ``"Ant-v5"``, or ``"Ant-v5 drawn"`` where it is made with a render mode.
-        definitions: The functions and classes at the top, each with the names that it uses; an
-            empty one for what is beside them.
-        encoding: Where it is neither UTF-8 nor ASCII, and so has not been read: its name, or an
-            empty one where there is none.
-        is_python: Of this version.
-        is_whole: Whether that is all; else there is more of a kind than is kept.
+        ids: Texts such as ``"Ant-v5"``, or ``"Ant-v5 drawn"`` if made with a render mode.
+        definitions: The top-level functions and classes, each with the names that it uses; an
+            empty name for the code outside of them.
+        encoding: The name of an encoding other than UTF-8 and ASCII, whose file stays unread; empty
+            if the encoding does not exist.
+        is_python: Whether it is Python of this version.
+        is_whole: Whether the rows are complete; else a kind exceeded its limit.
     """
 
     imports: tuple[ImportStatement, ...] = ()
@@ -85,10 +85,10 @@ class ParsedFile:
 
 
 def read(snapshot: Snapshot) -> dict[str, ParsedFile | None]:
-    """Every Python file of a snapshot; None for those that have not been read.
+    """Reads every Python file of a snapshot; None for files that stay unread.
 
-    That is: larger than a person writes, beyond what all may take, or what the parser has not
-    survived.
+    These are files beyond the size that a person writes or beyond the size of all files, and files
+    that crashed the parser.
     """
     names = sorted(file.path for file in snapshot.files if file.path.endswith(".py"))
     found: dict[str, ParsedFile | None] = dict.fromkeys(names)
@@ -102,9 +102,9 @@ def read(snapshot: Snapshot) -> dict[str, ParsedFile | None]:
 
 
 def content(path: Path, most: int) -> bytes | None:
-    """A regular file's bytes; None if they are more, or it is none.
+    """Returns a regular file's bytes; None for other files, or if there are more than ``most``.
 
-    It is opened once: what was looked at is what is read, and a link is not followed.
+    Opens the file once, so that the checked file is the one that is read; follows no link.
     """
     try:
         with open(path, "rb", opener=_open_no_link) as file:
@@ -121,7 +121,7 @@ def _open_no_link(path: str, flags: int) -> int:
 
 
 def parsed(texts: Mapping[str, bytes]) -> dict[str, ParsedFile | None]:
-    """What each text is; None where it was too much for a child."""
+    """Parses each text; None for a text that cost a child too much."""
     found: dict[str, ParsedFile | None] = dict.fromkeys(texts)
     waiting = list(texts)
     for _ in range(MOST_LOST):
@@ -130,7 +130,7 @@ def parsed(texts: Mapping[str, bytes]) -> dict[str, ParsedFile | None]:
         answers = list(_answers([texts[name] for name in waiting]))
         for name, answer in zip(waiting, answers, strict=False):
             found[name] = answer
-        waiting = waiting[len(answers) + 1 :]  # the next one is what ended it
+        waiting = waiting[len(answers) + 1 :]  # the next text ended the child
     return found
 
 
@@ -140,7 +140,7 @@ def _answers(texts: list[bytes]) -> Iterator[ParsedFile | None]:
             given.write(len(text).to_bytes(4, "big"))
             given.write(text)
         given.seek(0)
-        with contextlib.suppress(subprocess.TimeoutExpired):  # what it has answered counts
+        with contextlib.suppress(subprocess.TimeoutExpired):  # its answers before the timeout count
             subprocess.run(
                 [sys.executable, "-I", "-S", parser.__file__],
                 stdin=given,
@@ -152,7 +152,7 @@ def _answers(texts: list[bytes]) -> Iterator[ParsedFile | None]:
                 check=False,
             )
         taken.seek(0)
-        for line in taken.read(parser.OUTPUT).split(b"\n")[:-1]:  # the last one may be cut off
+        for line in taken.read(parser.OUTPUT).split(b"\n")[:-1]:  # the last line may be cut off
             yield _answer(json.loads(line))
 
 
@@ -175,7 +175,7 @@ _MOST_ROUNDS = 100
 
 @dataclass(frozen=True)
 class Import:
-    """A module that is imported: its first name, where, and its whole name."""
+    """An imported module: its first name, the place of the import, and its whole name."""
 
     name: str
     file: str
@@ -184,17 +184,17 @@ class Import:
 
 
 def imports(snapshot: Snapshot, files: Files) -> list[Import]:
-    """What the entry file imports, and the repository's own modules that it leads to.
+    """Lists the imports of the entry file, and of the repository's modules that it leads to.
 
-    A function's or class's own imports count if something that runs uses its name, as far as the
-    text says. What may be missing does not count, nor what nothing leads to.
+    The imports in a function or class count if code that runs uses its name, as far as the text
+    shows. Optional imports and unreachable modules do not count.
     """
     found = _ImportWalk(snapshot, files).imports
     return sorted(found, key=attrgetter("file", "line", "name"))
 
 
 def ids(snapshot: Snapshot, files: Files) -> list[tuple[str, str, int]]:
-    """Texts such as ``"Ant-v5"`` in the entry file and what it leads to, with file and line."""
+    """Lists texts such as ``"Ant-v5"`` in the entry file and the files it leads to, with places."""
     reached = sorted(_ImportWalk(snapshot, files).files)
     return [
         (text, file, line) for file in reached if (one := files[file]) for text, line in one.ids
@@ -202,7 +202,7 @@ def ids(snapshot: Snapshot, files: Files) -> list[tuple[str, str, int]]:
 
 
 class _ImportWalk:
-    """What runs where ``make_env`` does, by the names that it uses."""
+    """Follows the code that runs with ``make_env``, by the names that it uses."""
 
     def __init__(self, snapshot: Snapshot, files: Files) -> None:
         self._parsed = files
@@ -233,7 +233,7 @@ class _ImportWalk:
 
 
 def _targets(statement: ImportStatement, file: str, files: set[str]) -> Iterator[tuple[str, str]]:
-    """Each module that is named, and the repository's own file if it is one."""
+    """Yields each module in a statement, and the repository's own file of that name, if any."""
     folder, dotted = named_modules(statement, file)
     for number, name in enumerate(dotted):
         own = next((path for path in candidates(name, folder) if path in files), "")
@@ -244,8 +244,8 @@ def _targets(statement: ImportStatement, file: str, files: set[str]) -> Iterator
 
 
 def named_modules(statement: ImportStatement, file: str) -> tuple[str, list[str]]:
-    """The folder that a statement in a file is about, and what it may import, dotted; first what
-    it surely does.
+    """Returns the folder that a statement refers to, and the dotted names that it may import; first
+    the name that it always imports.
     """
     folder = file.rpartition("/")[0]
     for _ in range(statement.level - 1):
@@ -257,7 +257,7 @@ def named_modules(statement: ImportStatement, file: str) -> tuple[str, list[str]
 
 
 def candidates(name: str, folder: str) -> Iterator[str]:
-    """The files that a module's name can mean in a file of this folder."""
+    """Yields the files that a module's name may mean in a file of this folder."""
     path = name.replace(".", "/")
     for below in dict.fromkeys((folder, "", "src")):
         base = f"{below}/{path}".strip("/")
@@ -265,7 +265,7 @@ def candidates(name: str, folder: str) -> Iterator[str]:
 
 
 def of_module(name: str) -> list[str]:
-    """The distributions that bring a module, the usual one first; empty where none is known."""
+    """Returns the distributions that bring a module, the usual first; empty if none is known."""
     table = _table()
     while name and name not in table:
         name = name.rpartition(".")[0]

@@ -1,9 +1,8 @@
 """Environments that a package registers with Gymnasium: ``pypi:NAME[EXTRA][@VERSION]#ID``.
 
-``hub.reference`` says how they begin. The
-name of the repository is ``NAME[EXTRA]#ID``, and its revision the version. Its entry file is
-generated and runs in a jail, as any repository's: what is in the package is looked at there.
-``registered_env.txt`` is its text but for what the reference says.
+``hub.reference`` knows the prefix. The repository's name is ``NAME[EXTRA]#ID``, its revision the
+version. Its entry file is generated from ``registered_env.txt`` and the reference, and runs in a
+jail like that of any repository: only there is the package imported.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ _ID = r"(?a)[A-Za-z0-9_][A-Za-z0-9_.:/-]{0,199}"
 
 
 def read(text: str) -> Parts:
-    """The parts of a reference, before they are looked at; ``==`` is another ``@``."""
+    """Splits a reference into unchecked parts; ``==`` means ``@``."""
     wanted, hash_, env_id = text[len(_PREFIX) :].strip().partition("#")
     if not hash_:
         raise Wrong("the environment's id is missing", GRAMMAR)
@@ -35,7 +34,7 @@ def read(text: str) -> Parts:
 
 
 def check(parts: Parts) -> None:
-    """Raise ``Wrong`` unless an index and a registry could have it."""
+    """Raise ``Wrong`` unless an index and a registry could have the parts."""
     package, env_id = parts.repo_id.partition("#")[::2]
     if not re.fullmatch(_PACKAGE, package):
         raise Wrong(f"{package[:200]!r} is not the name of a package", GRAMMAR)
@@ -50,7 +49,7 @@ _TEMPLATE = Path(__file__).with_name("registered_env.txt")
 
 
 def entry(parts: Parts) -> bytes:
-    """The bytes of the file; the same for the same reference."""
+    """Returns the bytes of the entry file; equal for equal references."""
     package, _, env_id = parts.repo_id.partition("#")
     requirement = package if parts.revision is None else f"{package}=={parts.revision}"
     text = _TEMPLATE.read_text("utf-8")

@@ -1,4 +1,4 @@
-"""TOML that a stranger may have written, read within bounds."""
+"""Reads TOML within bounds, since a stranger may have written it."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ else:
     import tomli as tomllib
 
 _MAX_DOTS = 2000
-"""Outside of texts: the time that a parser takes grows with the square of the parts of a key."""
+"""Dots outside of texts: a parser's time grows with the square of the parts of a key."""
 _TEXT = re.compile(r"\"(?:[^\"\\\n]|\\.)*\"|'[^'\n]*'")
 _TIME = re.compile(r":\d\d\.\d")
 
 
 def loads(text: str, most: int, *, generated: bool = False) -> dict[str, Any]:
-    """A document of at most so many characters; ``ValueError`` if it is none, or too long.
+    """Parses a document of at most ``most`` characters; ``ValueError`` if invalid or too long.
 
-    One that is ``generated`` has no texts of several lines, and dots in its texts do not count.
+    A ``generated`` document has no texts of several lines, and dots in its texts do not count.
     """
     if len(text) > most:
         raise ValueError(f"it has {len(text)} characters; at most {most} are read")
     counted = text
     if generated:
-        # texts of several lines could hide what is none from this count
+        # a text of several lines could hide dots from this count
         if '"""' in text or "'''" in text:
             raise ValueError("it has a text of several lines")
         counted = _TIME.sub("", _TEXT.sub("", text))
@@ -41,7 +41,7 @@ def loads(text: str, most: int, *, generated: bool = False) -> dict[str, Any]:
 
 
 def table(given: object, *names: str) -> Mapping[str, Any]:
-    """A table within tables; an empty one where there is none."""
+    """Returns a table within tables; an empty table if there is none."""
     for name in names:
         given = given.get(name) if isinstance(given, dict) else None
     return given if isinstance(given, dict) else {}

@@ -1,4 +1,4 @@
-"""``envhub init``: a new environment's repository, which loads and steps as it is."""
+"""``envhub init``: writes a new environment's repository, which loads and steps unchanged."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def init(
 
 
 def repository_name(folder: Path) -> str:
-    """The name that a folder gives to its repository. Raises ``UsageError``."""
+    """Returns a repository's name, from its folder. Raises ``UsageError``."""
     name = folder.absolute().name
     if not _NAME.fullmatch(name) or "--" in name or ".." in name or name.endswith(".git"):
         raise UsageError(
@@ -60,7 +60,7 @@ def repository_name(folder: Path) -> str:
 
 
 def _write(folder: Path, files: dict[str, str]) -> None:
-    """Every file, or none. Raises ``UsageError``."""
+    """Write all files, or none. Raises ``UsageError``."""
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UsageError(f"{folder} exists and is not empty; choose another folder")
@@ -266,8 +266,8 @@ lerobot-eval --env.discover_packages_path=envhub_sandbox.integrations.lerobot \\
 
 
 def starter(name: str, year: int, *, lerobot: bool = False) -> dict[str, str]:
-    """The files of a new repository, by path.
-    ``lerobot``: whether it observes what LeRobot's policies are given.
+    """Returns the files of a new repository, by path.
+    ``lerobot``: whether its observations have the keys of LeRobot's policies.
     """
     given = {"name": name, "year": str(year)}
     chosen = _FOR_LEROBOT if lerobot else _PLAIN
