@@ -26,17 +26,17 @@ from envhub_sandbox.vector.vector_env import SandboxVectorEnv, refuse_limit
 
 
 class SandboxEnv(SingleEnv, gymnasium.Env[Any, Any]):
-    """One environment of a repository, in a sandbox of its own.
+    """One environment of a repository, in its own sandbox.
 
     Args:
-        ref: What ``make_env`` takes: a hub reference, a folder, a config with ``hub_path``.
-        suite: Which suite of the repository; needed where there are several.
-        task: Which task of it; likewise.
-        render_mode: Handed to the repository's ``make_env``, if given.
-        options: ``make_env``'s.
+        ref: As in ``make_env``: a hub reference, a folder, a config with ``hub_path``.
+        suite: A suite of the repository; needed if there are several.
+        task: A task of the suite; needed if there are several.
+        render_mode: Passed to the repository's ``make_env``, unless it is None.
+        options: Further arguments of ``envhub_sandbox.make_env``.
 
     Raises:
-        ValueError: The repository has several environments, or not the one that is named.
+        ValueError: The repository has several environments, or lacks the named one.
         EnvHubError: As ``make_env``.
     """
 
@@ -59,8 +59,8 @@ class SandboxEnv(SingleEnv, gymnasium.Env[Any, Any]):
 def make_again(ref: Any, *, render_mode: str | None = None, **options: Any) -> SandboxEnv:
     """Make an environment again from its spec; ``gymnasium.make(env.spec)`` calls it.
 
-    As ``SandboxEnv``, but where the repository's ``make_env`` takes no ``render_mode``: then the
-    environment has the one that the repository gives it, and another is told by a warning.
+    As ``SandboxEnv``, except if the repository's ``make_env`` takes no ``render_mode``. Then the
+    repository chooses the render mode, and a warning says if it differs from the requested one.
     """
     try:
         return SandboxEnv(ref, render_mode=render_mode, **options)
@@ -92,16 +92,16 @@ def make_vector(
     """Make a repository's vector environment; ``gymnasium.make_vec`` calls it.
 
     Args:
-        ref: What ``envhub_sandbox.make_env`` takes.
+        ref: As in ``envhub_sandbox.make_env``.
         num_envs: Number of sub-environments.
-        suite: Which suite of the repository; needed where there are several.
-        task: Which task of it; likewise.
-        render_mode: Handed to the repository's ``make_env``, if given.
-        max_episode_steps: The repository's own, as a spec has it.
-        options: ``make_env``'s.
+        suite: A suite of the repository; needed if there are several.
+        task: A task of the suite; needed if there are several.
+        render_mode: Passed to the repository's ``make_env``, unless it is None.
+        max_episode_steps: The repository's own limit; another one is an error.
+        options: Further arguments of ``envhub_sandbox.make_env``.
 
     Raises:
-        ValueError: ``max_episode_steps`` is another number.
+        ValueError: ``max_episode_steps`` differs from the repository's limit.
     """
     suites = make_env(ref, n_envs=num_envs, **_with_render_mode(options, render_mode))
     with closed_if_it_fails(suites):

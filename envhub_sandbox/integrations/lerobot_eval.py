@@ -1,7 +1,7 @@
 """``lerobot-eval-sandboxed``: LeRobot's evaluation, with the Hub's code in the sandbox.
 
-It takes what ``lerobot-eval`` takes, and ``make_env``'s options as ``--sandbox.NAME=VALUE``, where
-a value is JSON or text: ``--sandbox.policy='{"gpu": true}'``.
+It takes the arguments of ``lerobot-eval``, and options of ``make_env`` as ``--sandbox.NAME=VALUE``.
+A value is JSON or text: ``--sandbox.policy='{"gpu": true}'``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _PREFIX = "--sandbox."
 
 
 def main() -> None:
-    """Take our options out of the command line, and hand the rest to LeRobot's own ``main``."""
+    """Remove our options from the command line, and call LeRobot's ``main`` with the rest."""
     if find_spec("lerobot") is None:
         sys.exit("lerobot-eval-sandboxed needs LeRobot: pip install 'envhub-sandbox[lerobot]'")
     from envhub_sandbox.integrations.lerobot import install
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def split_eval_arguments(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
-    """Our options by name, and the others."""
+    """Split arguments into our options, by name, and the others."""
     options, others = {}, []
     for argument in arguments:
         if not argument.startswith(_PREFIX):

@@ -4,9 +4,9 @@
     >>> from envhub_sandbox.integrations.metrics import EnvHubCollector
     >>> prometheus_client.REGISTRY.register(EnvHubCollector())
 
-Needs ``pip install 'envhub-sandbox[metrics]'``. Nothing is counted for it that is not counted
-anyway, and nothing is asked of a worker: a scrape reads what is there. Labels are ``repository``
-(with commit and entry file), ``suite`` and ``task``.
+Needs ``pip install 'envhub-sandbox[metrics]'``. A scrape reads counters that every environment has
+anyway, and sends no request to a worker. Labels are ``repository`` (with commit and entry file),
+``suite`` and ``task``.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class EnvHubCollector(Collector):
     """Collects the numbers of all environments; ``register`` it with a registry."""
 
     def collect(self) -> Iterator[Metric]:
-        """The metrics, one family each."""
+        """Yield a family for each metric."""
         rows = LEDGER.rows()
         for name, number, text in _COUNTERS:
             counter = CounterMetricFamily(name, text, labels=_LABELS)
@@ -95,5 +95,5 @@ def _latency(rows: list[Row]) -> Metric:
 
 
 def _values(row: Row) -> list[str]:
-    """The values of the labels. Trust: the worker chose suite and task."""
+    """Return the values of the labels. Trust: the worker chose suite and task."""
     return [printable(value, _LABEL_CHARS) for value in row.labels]

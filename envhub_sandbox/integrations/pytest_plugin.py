@@ -15,7 +15,7 @@ _MARK = "envhub"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--envhub-ref``."""
+    """Add the option ``--envhub-ref``."""
     group = parser.getgroup("envhub", "environments of the Hugging Face Hub, in a sandbox")
     group.addoption(
         "--envhub-ref",
@@ -25,7 +25,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """The marker that has the fixture's options."""
+    """Add the marker with the fixture's options."""
     config.addinivalue_line(
         "markers",
         f"{_MARK}(suite=, task=, **options): which environment envhub_env is, and further "
@@ -35,7 +35,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def envhub_env(request: pytest.FixtureRequest) -> Iterator[Any]:
-    """The vector environment of ``--envhub-ref``, in a sandbox, made for this test alone."""
+    """Make the vector environment of ``--envhub-ref`` in a sandbox, for one test."""
     ref = request.config.getoption("--envhub-ref")
     if ref is None:
         pytest.fail("the fixture envhub_env needs --envhub-ref REF, as in --envhub-ref .")
@@ -44,7 +44,7 @@ def envhub_env(request: pytest.FixtureRequest) -> Iterator[Any]:
 
     marks = request.node.iter_markers(_MARK)
     options: dict[str, Any] = {}
-    for mark in reversed(list(marks)):  # the nearest last, which wins
+    for mark in reversed(list(marks)):  # the nearest marker is last and wins
         options |= mark.kwargs
     chosen = options.pop("suite", None), options.pop("task", None)
     with make_env(_from_where_pytest_began(ref, request), **options) as suites:
@@ -52,7 +52,7 @@ def envhub_env(request: pytest.FixtureRequest) -> Iterator[Any]:
 
 
 def _from_where_pytest_began(ref: str, request: pytest.FixtureRequest) -> str:
-    """A folder's own path: a test may have gone elsewhere."""
+    """Make a folder's path absolute, because a test may have changed the working directory."""
     from envhub_sandbox.hub.reference import is_local
 
     began = request.config.invocation_params.dir

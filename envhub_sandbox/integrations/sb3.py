@@ -3,8 +3,8 @@
     >>> env = SandboxVecEnv.make("org/repo@<commit>", n_envs=8)
     >>> PPO("MlpPolicy", env).learn(100_000)
 
-Followed: ``stable_baselines3.common.vec_env.DummyVecEnv``, for results and for the order in which
-environments are reset: what is trained here has the same weights as what is trained there.
+Results, and the order in which sub-environments are reset, follow
+``stable_baselines3.common.vec_env.DummyVecEnv``, so that training gives the same weights.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ _Indices = int | Iterable[int] | None
 class SandboxVecEnv(VecEnv):
     """A vector environment as Stable-Baselines3's ``VecEnv``.
 
-    A ``VecEnv`` resets what has ended in the same step, and hands over the last observation as
-    ``info["terminal_observation"]``. Where the vector environment does not do so itself
-    (``AutoresetMode.SAME_STEP``), those that have ended are reset here, by ``reset_mask``.
+    A ``VecEnv`` resets a sub-environment in the step that ends its episode, and returns the last
+    observation as ``info["terminal_observation"]``. Unless the vector environment does this itself
+    (``AutoresetMode.SAME_STEP``), this class resets ended sub-environments by ``reset_mask``.
 
-    Infos are each sub-environment's own, as it gave them. Only what a repository's own vector class
-    or a wrapper around ``vector`` has joined is taken apart here: numbers are Python's then.
+    Each info is the sub-environment's own. Only if a repository's own vector class or a wrapper
+    around ``vector`` has joined the infos, this class splits them; then numbers are Python's.
 
     Args:
-        vector: What ``make_env`` made.
+        vector: A vector environment from ``make_env``.
 
     Attributes:
-        vector: The same, for ``sandbox`` and the rest.
+        vector: The same vector environment, which has ``sandbox`` and further attributes.
     """
 
     def __init__(self, vector: VectorEnv[Any, Any, Any]) -> None:
@@ -69,17 +69,17 @@ class SandboxVecEnv(VecEnv):
         task: int | str | None = None,
         **options: Any,
     ) -> SandboxVecEnv:
-        """The environments of a repository.
+        """Make the environments of a repository.
 
         Args:
-            ref: What ``make_env`` takes.
+            ref: As in ``make_env``.
             n_envs: Number of sub-environments.
-            suite: Which suite of the repository; needed where there are several.
-            task: Which task of it; likewise.
-            options: ``make_env``'s.
+            suite: A suite of the repository; needed if there are several.
+            task: A task of the suite; needed if there are several.
+            options: Further arguments of ``make_env``.
 
         Raises:
-            ValueError: The repository has several environments, or not the one that is named.
+            ValueError: The repository has several environments, or lacks the named one.
             EnvHubError: As ``make_env``.
         """
         with closed_if_it_fails(make_env(ref, n_envs=n_envs, **options)) as suites:
@@ -91,12 +91,12 @@ class SandboxVecEnv(VecEnv):
         return list(self.vector.envs)
 
     def set_options(self, options: Any = None) -> None:
-        """Options for the next ``reset``: a mapping for all, or a list with one for each."""
+        """Set the options of the next ``reset``: a mapping for all, or a list with one for each."""
         self._one_for_all = not isinstance(options, (list, tuple))
         super().set_options(options)
 
     def reset(self) -> Any:
-        """Observations, with the seeds of ``seed()`` and the options of ``set_options()``."""
+        """Reset all with the seeds of ``seed()`` and the options of ``set_options()``."""
         seeds, options, together = self._seeds, self._options, self._one_for_all
         self._reset_seeds()
         self._reset_options()
@@ -109,7 +109,7 @@ class SandboxVecEnv(VecEnv):
         return batch
 
     def _reset(self, seeds: Any, options: dict[str, Any] | None, mask: Any) -> Any:
-        """The observations of all after a reset of those of ``mask``, or of all for None."""
+        """Reset the sub-environments of ``mask``, all for None; return all observations."""
         if self._apart is not None:
             batch, infos = self._apart.reset(seeds, options, mask)
         elif mask is None:
@@ -130,10 +130,10 @@ class SandboxVecEnv(VecEnv):
         self.vector.step_async(actions)
 
     def step_wait(self) -> Any:
-        """Observations, rewards float32 ``(num_envs,)``, dones bool ``(num_envs,)``, infos."""
+        """Return observations, rewards (float32) and dones (bool) ``(num_envs,)``, and infos."""
         wait = self.vector.step_wait if self._apart is None else self._apart.step_wait
         batch, rewards, terminations, truncations, batched = wait()
-        with UNTRUSTED:  # of a repository's own class, whose results nothing declares
+        with UNTRUSTED:  # a repository's own vector class may return anything
             dones = np.logical_or(terminations, truncations).reshape(self.num_envs)
             infos = self._infos(batched)
             for index, info in enumerate(infos):
@@ -144,7 +144,7 @@ class SandboxVecEnv(VecEnv):
         return batch, rewards, dones, infos
 
     def _begin_again(self, batch: Any, dones: Any, infos: list[dict[str, Any]]) -> Any:
-        """The observations with which those that have ended begin; ``infos`` gets their last."""
+        """Return the observations after resets of ended episodes; ``infos`` gets their last."""
         ended = [index for index in range(self.num_envs) if dones[index]]
         if self._resets_in_the_same_step:
             with UNTRUSTED:
@@ -157,7 +157,7 @@ class SandboxVecEnv(VecEnv):
         return self._reset(None, None, dones)
 
     def _begun(self, ended: list[int], infos: list[dict[str, Any]]) -> None:
-        """Take apart what belongs to the end of an episode, and to the beginning of the next."""
+        """Split infos into those of an episode's end and those of the next one's beginning."""
         for index in ended:
             begun = infos[index]
             last = begun.pop("final_info", {})
@@ -166,11 +166,11 @@ class SandboxVecEnv(VecEnv):
             infos[index], self.reset_infos[index] = last, begun
 
     def close(self) -> None:
-        """End their processes. Idempotent."""
+        """End the processes of the sub-environments. Idempotent."""
         self.vector.close()
 
     def get_attr(self, attr_name: str, indices: _Indices = None) -> list[Any]:
-        """An attribute of each sub-environment, or of those at ``indices``."""
+        """Return an attribute of each sub-environment, or of those at ``indices``."""
         if attr_name == "render_mode":
             return [self.vector.render_mode] * len(list(self._get_indices(indices)))
         chosen = list(self._get_indices(indices))
@@ -186,10 +186,10 @@ class SandboxVecEnv(VecEnv):
     def set_attr(self, attr_name: str, value: Any, indices: _Indices = None) -> None:
         """Set an attribute of each sub-environment's outermost wrapper, as ``setattr`` does.
 
-        ``env_method("set_wrapper_attr", name, value)`` sets it where it is.
+        ``env_method("set_wrapper_attr", name, value)`` sets it in the wrapper that has it.
 
         Raises:
-            ValueError: A repository's own vector class sets it in all or in none.
+            ValueError: A repository's own vector class can set it only in all sub-environments.
         """
         chosen = list(self._get_indices(indices))
         if self._is_plain:
@@ -202,7 +202,7 @@ class SandboxVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: _Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of each sub-environment, or of those at ``indices`` alone."""
+        """Call a method of each sub-environment, or of those at ``indices``."""
         chosen = list(self._get_indices(indices))
         if chosen == list(range(self.num_envs)):
             return list(self.vector.call(method_name, *method_args, **method_kwargs))
@@ -216,7 +216,7 @@ class SandboxVecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """The frames of the sub-environments, if the render mode is ``rgb_array``."""
+        """Return the frames of the sub-environments if the render mode is ``rgb_array``."""
         if self.render_mode == "rgb_array":
             return self.vector.render() or [None] * self.num_envs
         warnings.warn(
@@ -227,7 +227,7 @@ class SandboxVecEnv(VecEnv):
         return [None] * self.num_envs
 
     def _infos(self, infos: dict[Any, Any]) -> list[dict[Any, Any]]:
-        """Each sub-environment's; those of an end of an episode with those of the beginning."""
+        """Return an info for each sub-environment, merged from an episode's end and the next."""
         if self._apart is None:
             return [_plain(info_of(infos, index, self.num_envs)) for index in range(self.num_envs)]
         own = self._apart.each(infos)
@@ -235,7 +235,7 @@ class SandboxVecEnv(VecEnv):
 
 
 def _batch_of(space: spaces.Space[Any], members: Any) -> Any:
-    """Members of the space as a batch; of spaces that are arrays as they are."""
+    """Batch the members of a space: joins mappings and tuples, and returns others unchanged."""
     if isinstance(space, spaces.Dict):
         return {key: _batch_of(sub, [m[key] for m in members]) for key, sub in space.items()}
     if isinstance(space, spaces.Tuple):
@@ -245,7 +245,7 @@ def _batch_of(space: spaces.Space[Any], members: Any) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers of arrays that numpy has made of Python's are these again."""
+    """Convert numpy's numbers, which joining made of Python's, back to Python's."""
     if isinstance(value, dict):
         return {key: _plain(member) for key, member in value.items()}
     return value.item() if isinstance(value, (np.int64, np.float64, np.bool_)) else value

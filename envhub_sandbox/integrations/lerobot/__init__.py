@@ -3,10 +3,10 @@
     lerobot-eval --env.discover_packages_path=envhub_sandbox.integrations.lerobot \\
         --env.type=envhub_sandbox --env.repo=org/repo@<commit> --policy.path=...
 
-Importing this package registers that type. What is a configuration of the Hub already, or a plain
-reference, comes to the sandbox by ``install()``, after which LeRobot's ``make_env`` loads none of
-the Hub's code into this process; ``lerobot-eval-sandboxed`` is ``lerobot-eval`` after it. See
-``docs/lerobot.md``.
+Importing this package registers that type. ``install()`` brings LeRobot's own configurations of the
+Hub, and plain references, into the sandbox: after it, LeRobot's ``make_env`` loads none of the
+Hub's code into this process. ``lerobot-eval-sandboxed`` is ``lerobot-eval`` after ``install()``.
+See ``docs/lerobot.md``.
 """
 
 from __future__ import annotations

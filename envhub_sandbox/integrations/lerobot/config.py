@@ -1,7 +1,7 @@
 """``--env.type=envhub_sandbox``: a repository of the Hub as one of LeRobot's own configurations.
 
-It is no ``HubEnvConfig``: LeRobot refuses those without ``trust_remote_code``, which the sandbox
-does not need, and ``lerobot-train`` refuses them altogether.
+The type is no ``HubEnvConfig``, because LeRobot refuses those without ``trust_remote_code``, which
+the sandbox does not need, and ``lerobot-train`` refuses all of them.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class SpareSuites:
 
     LeRobot reads the features of an environment before it makes any. The same jail is used for
     both, so that a simulator is loaded once. If no request follows within ``seconds``, as before a
-    training whose first evaluation is an hour away, it is closed. One is kept for each key.
+    training whose first evaluation is an hour away, they are closed. Each key keeps one ``suites``.
     """
 
     def __init__(self, seconds: float = 60.0) -> None:
@@ -109,22 +109,22 @@ def _with_options(config: type[Any]) -> type[Any]:
 class SandboxedEnvConfig(EnvConfig):
     """The environments of a repository, each in a sandbox.
 
-    Making one fetches the repository and asks it for its spaces, in a jail; ``repo`` is a full
-    commit from then on, also in what LeRobot saves. No token is a field: LeRobot prints and saves
-    configurations. It is taken from where huggingface_hub has it.
+    Creating a configuration downloads the repository and reads its spaces, in a jail. From then on
+    ``repo`` has the full commit, also in files that LeRobot saves. There is no field for a token,
+    because LeRobot prints and saves configurations; the token is huggingface_hub's own.
 
     Attributes:
-        repo: What ``envhub_sandbox.make_env`` takes: a hub reference, or a folder.
-        suite: The only suite that is wanted; all by default.
-        task: The only task that is wanted, by its id; all by default.
-        fps: What the environments say, where they do.
-        features: From their spaces; what is given is added, or replaces what has the same key.
-        features_map: Likewise; by default what LeRobot's own processors call them.
-        state_keys: Of observations in the form of Isaac Lab Arena, those of ``policy`` that make
-            the state, separated by commas; all by default.
-        camera_keys: Likewise, of ``camera_obs``.
+        repo: As in ``envhub_sandbox.make_env``: a hub reference, or a folder.
+        suite: The only suite to make; all by default.
+        task: The id of the only task to make; all by default.
+        fps: The environments' ``render_fps``, if their metadata has it.
+        features: The features of the spaces; the user's are added, and win for the same key.
+        features_map: The policies' name of each feature; by default that of LeRobot's processors.
+        state_keys: For observations in the form of Isaac Lab Arena, the keys of ``policy`` that
+            form the state, separated by commas; all by default.
+        camera_keys: The same for ``camera_obs``.
 
-    The others are ``make_env``'s options; ``dependencies`` takes its mapping as JSON.
+    The other fields are ``make_env``'s options; ``dependencies`` takes its mapping as JSON.
     """
 
     features: dict[str, PolicyFeature] = field(default_factory=dict)
@@ -141,14 +141,14 @@ class SandboxedEnvConfig(EnvConfig):
         except (EnvHubError, ValueError, TypeError) as error:
             if not _on_lerobots_command_line():
                 raise
-            # draccus catches these two, and prints a hundred lines of its own around them
+            # draccus would catch a ValueError or TypeError, and print a hundred lines around it
             sys.exit(f"{Path(sys.argv[0]).name}: {error}")
 
     def _open(self) -> None:
         if not self.repo:
             if _on_lerobots_command_line():
                 raise ValueError(_NO_REPO)
-            return  # LeRobot's tests make one of each type; what is wanted of it says what it lacks
+            return  # LeRobot's tests make each type without arguments; create_envs raises later
         endpoint = self._options()["endpoint"]
         if endpoint is not None and without_login(endpoint) != endpoint:
             raise HubReferenceError(
@@ -259,9 +259,9 @@ def _on_lerobots_command_line() -> bool:
 
 
 def _expected() -> tuple[int, bool]:
-    """How many sub-environments LeRobot's command line will ask for, and whether async.
+    """Guess the number of sub-environments that LeRobot will request, and whether async.
 
-    A guess, to open one jail instead of two; another number opens another jail.
+    A right guess saves a second jail; after a wrong one the request opens another jail.
     """
     if parser.parse_arg("env.repo") is None:
         return 1, False

@@ -1,7 +1,7 @@
 """Chooses LeRobot's processor steps for an environment, and the features that its policies see.
 
-Followed: ``preprocess_observation`` of ``lerobot.envs.utils``, which decides what is passed on, and
-under which name, and the steps of ``lerobot.processor.env_processor`` that may follow it.
+This follows ``preprocess_observation`` of ``lerobot.envs.utils``, which chooses and names the parts
+of an observation, and the steps of ``lerobot.processor.env_processor`` that may come after it.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ class Feature(NamedTuple):
 
 @dataclass(frozen=True)
 class Step:
-    """A processor step of LeRobot's, by its registered name."""
+    """A processor step of LeRobot, by its registered name."""
 
     name: str
     config: dict[str, Any] = field(default_factory=dict)
 
 
 def processors(steps: list[Step]) -> Any:
-    """LeRobot's pipeline of these steps."""
+    """Make LeRobot's pipeline of these steps."""
     return PolicyProcessorPipeline(
         steps=[ProcessorStepRegistry.get(step.name)(**step.config) for step in steps]
     )
@@ -66,11 +66,11 @@ def processors(steps: list[Step]) -> Any:
 def steps_for(
     observations: Space[Any], metadata: Mapping[str, Any], keys: Mapping[str, str | None]
 ) -> list[Step]:
-    """The steps that the repository names, else LeRobot's own for observations of this form.
+    """Return the steps that the repository names, else LeRobot's for observations of this form.
     ``metadata``: the environment's metadata. Trust: input from the worker.
     ``keys``: the caller's ``state_keys`` and ``camera_keys``, as IsaaclabArenaEnv takes them.
-    Raises ``ValueError``: the repository names a step that it may not name, or that is not so
-    configured.
+    Raises ``ValueError``: the repository names a step that is not permitted, or configures it
+    wrongly.
     """
     if metadata.get(DECLARED) is not None:
         return [*_declared(metadata[DECLARED])]
@@ -88,7 +88,7 @@ def steps_for(
 
 
 def _declared(declared: object) -> Iterator[Step]:
-    """Plain data in the form of LeRobot's own files: nothing is imported by a name in it."""
+    """Read declared steps, data in the form of LeRobot's own files; imports nothing by name."""
     steps = declared.get("steps") if isinstance(declared, dict) else declared
     for step in steps if isinstance(steps, (list, tuple)) else [steps]:
         name = step.get("registry_name") if isinstance(step, dict) else None
@@ -108,7 +108,7 @@ def _declared(declared: object) -> Iterator[Step]:
 
 
 def _is_configured(config: object, kinds: Mapping[str, type[Any]]) -> bool:
-    """Whether a configuration has exactly these fields, of these types, with texts."""
+    """Whether a configuration has exactly these fields, of these types, and only texts in them."""
     if not isinstance(config, dict) or config.keys() != kinds.keys():
         return False
     for key, value in config.items():
@@ -121,11 +121,11 @@ def _is_configured(config: object, kinds: Mapping[str, type[Any]]) -> bool:
 def features_of(
     observations: Space[Any], actions: Space[Any], steps: list[Step], *, others: bool
 ) -> dict[str, Feature]:
-    """The features by keys of the observation, or, for one of several cameras, by the name that
-    LeRobot records it under.
+    """Return the features by key of the observation, or by LeRobot's own name for one of several
+    cameras.
 
-    Observations without a tensor in LeRobot are left out, and actions that are not a vector.
-    ``others``: whether this LeRobot passes on vectors of other names.
+    Leaves out observations that LeRobot does not make a tensor of, and actions that are no vector.
+    ``others``: whether this LeRobot passes on vectors with other names.
     """
     inner = observations.spaces if isinstance(observations, Dict) else {}
     seen = {key: item for name in inner for key, item in _passed_on(name, inner[name], others)}
@@ -148,7 +148,7 @@ def features_of(
 
 
 def left_out(observations: Space[Any], seen: Mapping[str, Feature]) -> list[str]:
-    """The keys of an observation that no policy sees."""
+    """Return the keys of an observation that no policy sees."""
     if not isinstance(observations, Dict):
         return [f"the {type(observations).__name__}"]
     sources = {item.source for item in seen.values()}
@@ -156,7 +156,7 @@ def left_out(observations: Space[Any], seen: Mapping[str, Feature]) -> list[str]
 
 
 def _passed_on(name: str, space: Space[Any], others: bool) -> Iterator[tuple[str, Feature]]:
-    """The features that ``preprocess_observation`` makes of one key."""
+    """Yield the features that ``preprocess_observation`` makes of one key."""
     if name == "pixels":
         yield from _pixels(space)
     elif name in _NAMED and isinstance(space, Box):
@@ -166,7 +166,7 @@ def _passed_on(name: str, space: Space[Any], others: bool) -> Iterator[tuple[str
 
 
 def _pixels(space: Space[Any]) -> Iterator[tuple[str, Feature]]:
-    """One camera, or several by their names; each (height, width, channels)."""
+    """Yield one camera, or several by name; each has the shape (height, width, channels)."""
     if isinstance(space, Dict):
         yield from _cameras(space, space.spaces, "pixels")
     elif isinstance(space, Box) and len(space.shape) == 3:
@@ -181,7 +181,7 @@ def _cameras(space: Any, names: Any, source: str) -> Iterator[tuple[str, Feature
 
 
 def _arena(inner: Mapping[str, Any], config: dict[str, Any]) -> Iterator[tuple[str, Feature]]:
-    """``IsaaclabArenaProcessorStep`` joins states, and passes nothing else on than its cameras."""
+    """Yield the joined states and the cameras, as ``IsaaclabArenaProcessorStep`` passes them on."""
     states = _boxes(inner.get("policy"))
     sizes = [prod(states[key].shape) for key in config["state_keys"] if key in states]
     if sizes:
@@ -195,7 +195,7 @@ def _boxes(space: Any) -> dict[str, Box]:
 
 
 def _inner(spaces: Mapping[str, Any], path: tuple[str, str]) -> Any:
-    """The space at a path in a ``robot_state``."""
+    """Return the space at a path in ``robot_state``, or None."""
     group = getattr(spaces.get("robot_state"), "spaces", {}).get(path[0])
     return getattr(group, "spaces", {}).get(path[1])
 
@@ -209,6 +209,6 @@ def _split(text: str) -> list[str]:
 
 
 def as_features(seen: Mapping[str, Feature]) -> tuple[dict[str, Any], dict[str, str]]:
-    """``features`` and ``features_map`` of an ``EnvConfig``."""
+    """Return ``features`` and ``features_map`` of an ``EnvConfig``."""
     features = {key: PolicyFeature(type=item.kind, shape=item.shape) for key, item in seen.items()}
     return features, {key: item.policy_key for key, item in seen.items()}

@@ -1,8 +1,8 @@
-"""LeRobot's own ``make_env``, with the Hub's part of it in the sandbox.
+"""Makes LeRobot's own ``make_env`` run the Hub's code in the sandbox.
 
-Its factory loads a repository in three steps, each a function that it looks up by its name when it
-is called: download, import, call. Those names are replaced; ``make_env`` itself cannot be, since
-LeRobot's programs have imported it already.
+LeRobot's factory loads a repository in three steps, download, import and call, each a function that
+``make_env`` looks up by name in its module. ``install`` replaces these functions. It cannot replace
+``make_env`` itself, because LeRobot's programs have imported it already.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _GIVEN = ("n_envs", "use_async_envs", "hub_cache_dir", "trust_remote_code")
 
 
 def install(**options: Any) -> None:
-    """From now on, LeRobot's ``make_env`` makes what the Hub has in the sandbox.
+    """From now on, have LeRobot's ``make_env`` make environments of the Hub in the sandbox.
 
-    That holds for references and for every ``HubEnvConfig``. ``trust_remote_code`` is neither
-    needed nor heeded. A later call replaces the options of an earlier one.
-    ``options``: ``envhub_sandbox.make_env``'s, for all repositories.
-    Raises ``TypeError``: an option that it does not have; ``RuntimeError``: this LeRobot loads
-    repositories in another way than is known here.
+    This holds for references and for every ``HubEnvConfig``; ``trust_remote_code`` is ignored.
+    A later call replaces the options of an earlier one.
+    ``options``: those of ``envhub_sandbox.make_env``, for all repositories.
+    Raises ``TypeError``: ``make_env`` has no such option; ``RuntimeError``: this LeRobot lacks the
+    functions to replace.
     """
     names = [key for key in OPTIONS if not OPTIONS[key].field and key not in _GIVEN]
     unknown = [name for name in options if name not in names]
@@ -53,7 +53,7 @@ def install(**options: Any) -> None:
     factory._call_make_env = routed.call
     if not ASKS_CONFIGS:
         hub_configs = lerobot.envs.configs.HubEnvConfig, SandboxedEnvConfig
-        factory.HubEnvConfig = hub_configs  # all that is done with it is isinstance()
+        factory.HubEnvConfig = hub_configs  # the factory only passes it to isinstance()
         _let_videos_be_written()
 
 
@@ -103,14 +103,14 @@ class _AsyncOrSandboxed(type):
 
 
 def _let_videos_be_written() -> None:
-    """LeRobot before 0.6 draws nothing but Gymnasium's two classes, by ``isinstance``.
+    """Let LeRobot before 0.6 render ours, too: it renders only Gymnasium's two vector classes.
 
-    So its evaluation, and it alone, sees a Gymnasium whose ``vector.AsyncVectorEnv`` includes ours.
+    Only its evaluation sees a ``gymnasium`` whose ``vector.AsyncVectorEnv`` includes our class.
     """
     try:
         import lerobot.scripts.lerobot_eval as evaluation
     except ImportError:
-        return  # an evaluation needs what is missing
+        return  # without this module there is no evaluation
     seen, vector = ModuleType("gymnasium"), ModuleType("gymnasium.vector")
     vars(vector).update(vars(gymnasium.vector))
     vars(vector)["AsyncVectorEnv"] = _AsyncOrSandboxed("AsyncVectorEnv", (), {})
