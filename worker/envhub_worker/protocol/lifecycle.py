@@ -6,7 +6,7 @@ from enum import Enum
 
 
 class State(Enum):
-    """Where an environment is; the value is what a user reads."""
+    """The state of an environment; the value is the text for users."""
 
     IDLE = "not started"
     READY = "ready"
@@ -22,7 +22,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """What happens to an environment."""
+    """An event in the life of an environment; the value describes it."""
 
     START = "its jail is up"
     SUBMIT = "a request was sent"

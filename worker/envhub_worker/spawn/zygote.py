@@ -65,18 +65,11 @@ _END_S = 5.0
 
 def main(argv: Sequence[str]) -> int:
     """Preload, then fork an init for each request until the server goes away."""
-    # In this order. Descriptors go first: what a fork inherits, every jail has. What may be
-    # imported before confinement is, since the server starts us before it needs us. The
-    # configuration is read then, and our end is tied to the server's before anything can take long.
-    # Confinement comes before any package of an interpreter that the server does not run itself.
-    # After ``enter`` this may be another process, the first one of a pid namespace: so what is a
-    # process's own, such as being the reaper of orphans, is set after it. Objects are frozen last,
-    # so that no collection in a jail writes to the pages that all of them share. From then on this
-    # process imports nothing, starts no thread, and reads nothing about a jail: it forks.
     control = int(argv[0])
-    process.close_all_but({0, 1, 2, control})
+    process.close_all_but({0, 1, 2, control})  # first, because every jail inherits descriptors
     channel = Channel(socket.socket(fileno=control))
-    gc.disable()  # what is imported stays, and to look through it again and again takes a tenth
+    gc.disable()  # imports leave no garbage, and collections would take a tenth of their time
+    # Before the configuration arrives: the server starts the zygote before it needs a jail.
     if argv[1:] == ["ahead"]:
         preload(_JAIL)
     elif argv[1:] == ["standard"]:
@@ -85,19 +78,23 @@ def main(argv: Sequence[str]) -> int:
     if received is None:
         return 0
     config = ZygoteConfig.from_wire(received[0])
-    process.die_with_parent(config.parent, signal.SIGTERM)
+    process.die_with_parent(config.parent, signal.SIGTERM)  # before anything that can take long
     try:
+        # Before this process imports a package of an interpreter that is not the server's.
         common = zygote.enter(config)
     except LayerUnavailableError as error:
         refuse(channel, error)
         return 0
+    # After ``enter``, which may continue in another process, the first of a pid namespace.
     process.become_subreaper()
     # A repository's output must not be lost in a buffer when its process dies.
     cast(io.TextIOWrapper, sys.stdout).reconfigure(line_buffering=True)
     if not config.packages:
         preload(config.target)
         common = replace(common, set_blas_threads=blas.find_setter())
-    gc.freeze()  # without looking through it: there is next to nothing that could go
+    # After all imports, so that no collection in a jail writes to the pages that all jails share.
+    # From here on this process only forks: it imports nothing and starts no thread.
+    gc.freeze()
     gc.enable()
     Zygote(channel, common).run()
     return 0
@@ -127,7 +124,7 @@ def refuse(channel: Channel, error: LayerUnavailableError) -> None:
 
 
 class Zygote:
-    """The loop: requests from the server, and the deaths of inits."""
+    """The loop: answers the server's requests, and reports the deaths of inits."""
 
     def __init__(self, channel: Channel, common: Common) -> None:
         self._channel = channel

@@ -23,7 +23,7 @@ from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.lockdown.seccomp.policy import SHARED_BYTES
 from envhub_worker.protocol.confinement import MIB, Reason
 
-#: Bytes a second that a jail may be expected to fill: a few cores on huge pages.
+#: The expected rate (bytes/s) at which a jail can fill memory: a few cores with huge pages.
 _FILL_RATE = 8 * 1024**3
 _SHORTEST_S, _LONGEST_S = 0.01, 1.0
 
@@ -56,7 +56,7 @@ class Usage:
 
     Attributes:
         private: Anonymous memory of each process, swap included.
-        kernel: What the kernel keeps for the processes: page tables, mappings, descriptors.
+        kernel: The kernel's own memory for the processes: page tables, mappings, descriptors.
         mapped: Shared mappings of memory without a name, by (device, inode).
         files: memfds that some process has open, by (device, inode).
         sockets: Names of open sockets.

@@ -13,9 +13,9 @@ from envhub_worker.lockdown.mechanisms import kernel, process, procfs
 
 CAP_CHOWN, CAP_SETGID, CAP_SETUID = 0, 6, 7
 
-# Far above the ranges that distributions, systemd and rootless containers hand out.
+# User ids far above the ranges that distributions, systemd and rootless containers assign.
 _HIGH = range(0x6E000000, 0x6EFFFFFF)
-# For a container whose own user namespace maps only 65536 users.
+# User ids for a container whose user namespace maps only 65536 users.
 _LOW = range(62000, 65000)
 
 

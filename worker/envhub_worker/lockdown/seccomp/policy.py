@@ -27,7 +27,7 @@ PRETEND = _ERRNO | 0
 
 @dataclass(frozen=True)
 class Check:
-    """Whether ``(args[arg] & mask) == value``; all 64 bits where ``wide``, else the low 32."""
+    """A test of ``(args[arg] & mask) == value``: of all 64 bits if ``wide``, else the low 32."""
 
     arg: int
     value: int
@@ -37,7 +37,7 @@ class Check:
 
 @dataclass(frozen=True)
 class ByArguments:
-    """The first rule whose checks all hold decides; else ``otherwise``."""
+    """A verdict by arguments: of the first rule whose checks all hold, else ``otherwise``."""
 
     rules: Rules
     otherwise: int

@@ -95,8 +95,8 @@ class Decoder:
         """Decodes a document. Trust: input from the other side.
 
         Raises:
-            MessageTooLargeError: Over a limit.
-            RemoteProtocolError: Malformed in any way.
+            MessageTooLargeError: The message exceeds a limit.
+            RemoteProtocolError: The message is malformed.
         """
         wire.check_document(document, self.limits)
         try:
@@ -112,7 +112,7 @@ class Decoder:
         except MemoryError as error:
             raise MessageTooLargeError("There is not enough memory to decode it.") from error
         except Exception as error:
-            # msgpack and numpy refuse in many ways, and hostile keys compare in many more.
+            # msgpack and numpy raise many types, and comparing hostile keys may raise any other.
             raise RemoteProtocolError(f"The header cannot be decoded: {error}") from error
         if self._heads:
             raise RemoteProtocolError("An extension that heads an array stands elsewhere.")

@@ -278,7 +278,7 @@ def _is_container(value: Any) -> bool:
 
 
 class _Walk:
-    """Copies a value, in order, until as many items as may be sent are spent."""
+    """Copies a value with descriptions in place of members that cannot or may not be sent."""
 
     def __init__(self, send: Send, limits: WireLimits) -> None:
         self._send = send
@@ -315,7 +315,7 @@ class _Walk:
         return True
 
     def members(self, value: Any, depth: int) -> Any:
-        """The container with each member replaced by ``value``."""
+        """Returns a container with each member replaced by the result of ``value``."""
         if isinstance(value, dict):
             pairs = [(self.value(k, depth + 1), self.value(v, depth + 1)) for k, v in value.items()]
             return dict(pairs)

@@ -103,7 +103,7 @@ _OPENERS = bytes([*range(0x80, 0xA0), *range(0xDC, 0xE0)])
 # msgpack's own ext code -1 becomes a Timestamp without asking us.
 _TIMESTAMP = re.compile(rb"[\xd4-\xd8]\xff|\xc7.\xff|\xc8..\xff|\xc9....\xff", re.DOTALL)
 
-# What an empty container has in the table of widths.
+# The entry of an empty container in the table of widths.
 _NO_ELEMENTS = -1
 _MAP, _ARRAY, _TEXT, _BINARY, _EXT = range(5)
 
@@ -114,8 +114,8 @@ def check_document(document: bytes, limits: WireLimits) -> None:
     Trust: input from the worker.
 
     Raises:
-        MessageTooLargeError: Deeper, longer or more numerous than ``limits``.
-        RemoteProtocolError: Not msgpack, or of a kind this protocol has no use for.
+        MessageTooLargeError: The document exceeds ``limits`` of depth, length or items.
+        RemoteProtocolError: It is not msgpack, or contains a type that this protocol does not use.
     """
     if not _looks_flat(document, limits):
         _walk(document, limits)

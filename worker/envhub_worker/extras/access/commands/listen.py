@@ -106,7 +106,7 @@ def _serve(
             ends.callback(Note(state, noted).remove)
         began = time.monotonic()
         ends.callback(lambda: log.say("stopped", "info", seconds=time.monotonic() - began))
-        # under ``nohup`` the end of a terminal does not end the server
+        # nohup has SIGHUP ignored; then the end of the terminal does not end the server
         ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
         hangs_up = [] if ignored else [signal.SIGHUP]
         server.stop_on(signal.SIGINT, *hangs_up, gently=(signal.SIGTERM,))
@@ -123,7 +123,7 @@ def _serve(
                 pid=os.getpid(),
             )
             server.run()
-        except Exception as error:  # not an error of the arguments: those are for ``run``
+        except Exception as error:  # no error of the arguments: ``run`` reports those
             gate.witness.failed(error)
             return 1
     return 0
@@ -134,12 +134,12 @@ def _announce(
 ) -> None:
     """Announce the address in the form that the starting program reads."""
     if arguments.ready_fd is not None:
-        with contextlib.suppress(BrokenPipeError):  # who started us has gone: the loop sees it
+        with contextlib.suppress(BrokenPipeError):  # the starting program ended: the loop notices
             os.write(arguments.ready_fd, f"{endpoint} {identity.public}\n".encode())
         os.close(arguments.ready_fd)
     elif around is not None:
         print(probe.announcement(around, server_key=identity.public), flush=True)
-    elif arguments.log_format == "text" or identity.authorized is None:  # a client needs it
+    elif arguments.log_format == "text" or identity.authorized is None:  # a client needs the key
         print(announcement(endpoint, identity), flush=True)
 
 
@@ -191,7 +191,7 @@ def _gate(
 ) -> RemoteGate:
     known = {} if identity.client is None else {identity.client.public: "the one client"}
     quotas = quotas_of(arguments)
-    # one, where nothing keeps a jail from the other clients' files
+    # only one client, if nothing keeps a jail from the files of other clients
     single = arguments.weakest_profile == "container" and landlock.version() < 1
     rules = Rules(
         keys=identity.keys,
@@ -210,7 +210,7 @@ def _gate(
         profile=identity.profile,
     )
     folder = state / "packages" if arguments.dependencies else None
-    # with those that programs of one user start, each with a key of its own for that program
+    # such servers of one user share the folder; each has its own key, for the program it serves
     shared = bool(arguments.only_client) and arguments.client_pidfd is not None
     packages = Packages(folder, quotas, arguments.packages_s, shared=shared)
     uploads = Uploads(state / "store", quotas, shared=shared)

@@ -131,7 +131,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="print the public key and what confines the server as one line of JSON, for the "
         "program that started this, instead of the line for the client",
     )
-    # of a program that starts a server for itself: see the head of __main__.py
+    # for a program that starts its own server: see the docstring of __main__.py
     for name in ("--client-pidfd", "--ready-fd"):
         parser.add_argument(name, type=int, help=argparse.SUPPRESS)
     _add_quotas(parser)
