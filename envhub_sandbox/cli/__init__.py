@@ -1,4 +1,4 @@
-"""The command line ``envhub``, a file or a folder for each command. This imports nothing heavy."""
+"""The command line ``envhub``: a file for each command, imported when the command is called."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ def main() -> None:
     from envhub_sandbox.system.platform import replace_missing_streams
 
     replace_missing_streams()
-    # its bars would get into ours, and into the stderr of scripts
+    # huggingface_hub's progress bars would mix with ours, and with the stderr of scripts
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal that knows ASCII only is no error
+        if isinstance(stream, io.TextIOWrapper):  # for terminals that show only ASCII
             stream.reconfigure(errors="backslashreplace")
     # so that a terminated run closes its environments and restores the terminal
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
@@ -24,5 +24,5 @@ def main() -> None:
         from envhub_sandbox.cli.app import app
 
         app(prog_name="envhub")
-    except KeyboardInterrupt:  # while still importing; later, commands report it themselves
+    except KeyboardInterrupt:  # during the imports; later, commands report it themselves
         sys.exit(130)

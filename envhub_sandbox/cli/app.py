@@ -1,7 +1,7 @@
 """The program ``envhub`` and its commands.
 
-Typer's classes have what all commands share, since no callback sees the errors of its parser:
-guarded output, help that is text, errors that name options.
+Subclasses of typer's classes do what all commands share, since no callback sees errors of typer's
+parser: they guard the output, print help as plain text, and name options in errors.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from envhub_sandbox.settings.options import OPTIONS, on_command_line, use_option
 from envhub_sandbox.system import extras
 
 Where = Mapping[str, str]
-"""The commands of a group: where the function of each is, below ``envhub_sandbox``."""
+"""The commands of a group, each with its function as ``module:function`` of ``envhub_sandbox``."""
 
-# each with the first line of its help, so that a list of them imports none
+# with the first line of each command's help, so that a list of commands imports none of them
 _COMMANDS: dict[str, tuple[str, str | Where]] = {
     "run": (
         "Play episodes of an environment and print returns, lengths, speed and provenance.",
@@ -79,9 +79,9 @@ _REPLACED = {
 
 
 class Program(TyperGroup):
-    """``envhub``: CI systems obey nothing of what it prints, usage errors included.
+    """``envhub``: CI systems find no commands in its output, usage errors included.
 
-    A command is imported when it is called: until then it has its name and its line in the list.
+    A command is imported when it is called; until then only its name and help line are known.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -92,7 +92,7 @@ class Program(TyperGroup):
             }
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that is called, with its options."""
+        """Import the called command and return it."""
         options = {word.partition("=")[0] for word in args if word.startswith("--")}
         for word in _REPLACED.keys() & {args[0], *options}:
             ctx.fail(f"There is no {word!r} any more: use '{_REPLACED[word]}'.")
@@ -122,11 +122,11 @@ class Program(TyperGroup):
 
 @contextlib.contextmanager
 def _wrong_usage(ctx: Any = None) -> Iterator[None]:
-    """Report what the parser refuses as every other error: one message, without a box."""
+    """Report the parser's errors like every other error: as one message, without a box."""
     try:
         yield
     except Exception as error:
-        # the parser's errors have this method; the place of their class depends on typer's version
+        # the parser's errors have this method; the module of their class varies with typer
         text = error.format_message() if hasattr(error, "format_message") else ""
         if not text:  # another error; or a command without arguments, which prints its help
             raise
@@ -141,12 +141,12 @@ def _wrong_usage(ctx: Any = None) -> Iterator[None]:
 
 
 class Command(TyperCommand):
-    """One command, whose errors name the options that it has."""
+    """A command whose errors name its own options."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         paragraphs = python.cleandoc(self.help or "").split("\n\n")
-        # rich keeps the ends of lines of all but the first
+        # rich keeps line breaks in all paragraphs but the first
         self.help = "\n\n".join(" ".join(text.split()) for text in paragraphs)
 
     def invoke(self, ctx: Any) -> Any:
@@ -156,12 +156,12 @@ class Command(TyperCommand):
             return super().invoke(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
-        """``--help-all`` is ``--help`` that leaves nothing out."""
+        """Parse options; ``--help-all`` is ``--help`` with all options."""
         self._whole_help = "--help-all" in args
         return super().parse_args(ctx, ["--help" if a == "--help-all" else a for a in args])
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print the help, in which rich reads no ``[word]`` of an option as markup."""
+        """Print the help, escaped so that rich reads no ``[word]`` of an option as markup."""
         for parameter in self.params:
             text = getattr(parameter, "help", None)
             if text:
@@ -182,7 +182,7 @@ def _comes_later(parameter: Any) -> bool:
 
 
 def functions(name: str) -> dict[str, Callable[..., None]]:
-    """The function of a command, or those of a group, by name."""
+    """Import the function of a command, or those of a group, by name."""
     address = _COMMANDS[name][1]
     functions = {}
     for command, path in ({name: address} if isinstance(address, str) else address).items():
@@ -192,7 +192,7 @@ def functions(name: str) -> dict[str, Callable[..., None]]:
 
 
 def whole_command(name: str) -> Any:
-    """A command, or a group, with all its options."""
+    """Make a command, or a group, with all its options."""
     text, address = _COMMANDS[name]
     typer_group = _typer(text)
     for command, function in functions(name).items():

@@ -1,4 +1,4 @@
-"""``envhub cache``: the stores of snapshots and environments, and what killed clients have left."""
+"""``envhub cache``: lists and removes snapshots and environments, and leftovers of clients."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _ENVIRONMENTS = "envhub_sandbox.extras.packages.environments"
 _WHEELS = "envhub_sandbox.extras.packages.builds.wheels"
 _DAY_S = 24 * 3600.0
 _SHOWN = 18
-"""Characters of a commit: twelve digits behind local-, as errors show it; --json has all."""
+"""The characters of a commit that are shown: ``local-`` and 12 digits; ``--json`` has all."""
 
 
 class Stored(Protocol):
@@ -49,12 +49,12 @@ class StoredSnapshot:
 
     Attributes:
         repository: ``"org/repo"``, with ``spaces/``, ``datasets/`` or ``git+https://HOST/`` in
-            front; a package's id with ``pypi:``; of folders ``"local"``.
-        revision: The branch or tag that it was fetched as, or None.
+            front; a package's id with ``pypi:``; for a folder ``"local"``.
+        revision: The branch or tag by which it was downloaded, or None.
         used: Unix time (seconds) of the last use.
-        size: Bytes of all files, as the record has them.
-        folder: Of ``"local"``: the folder that it was made of; another one of the same content is
-            the same snapshot.
+        size: Bytes of all files, as recorded.
+        folder: For ``"local"``, the folder from which it was made; another folder with the same
+            content has the same snapshot.
     """
 
     repository: str
@@ -71,8 +71,8 @@ class StoredSnapshot:
         return self.folder or self.repository
 
     def answers_to(self, name: str) -> bool:
-        """Whether a name means it: the repository, the folder, a commit's beginning, or repository
-        and commit with ``@``.
+        """Whether a name means this snapshot: the repository, the folder, the beginning of the
+        commit, or ``REPOSITORY@COMMIT``.
         """
         if self.folder is not None and self.folder == os.path.abspath(name):
             return True
@@ -83,7 +83,7 @@ class StoredSnapshot:
 
 
 def stored_snapshots() -> list[StoredSnapshot]:
-    """The snapshots in the store, the last used first. Verifies nothing."""
+    """Return the snapshots in the store, the last used first. Verifies nothing."""
     from envhub_sandbox.system.folders import cache_root
 
     folder = cache_root() / "snapshots"
@@ -156,7 +156,7 @@ def list_(json: opt.Json = False) -> None:
 
 
 def _every(module: str) -> list[Any]:
-    """The entries that an extra has stored; empty if it is not installed."""
+    """Return the entries that an extra has stored; empty if the extra is not installed."""
     every = extras.find(module, "every")
     return [] if every is None else list(every())
 
@@ -170,7 +170,7 @@ def _told(snapshots: list[StoredSnapshot], environments: list[Any], built: list[
 
 
 def _documents(entries: Sequence[Stored], **named: str) -> list[dict[str, Any]]:
-    """The entries as data; ``named``: the attribute of each further field."""
+    """Return entries as data. ``named``: the attribute for each further field."""
     return [
         {
             **{name: getattr(entry, attribute) for name, attribute in named.items()},
@@ -232,7 +232,7 @@ def remove(
 
 
 def _users_of(snapshot: StoredSnapshot) -> str:
-    """Remove a snapshot, unless processes use it; returns a sentence about these, or empty."""
+    """Remove a snapshot unless processes use it; returns a text that names them, or empty."""
     from envhub_sandbox.hub import store
 
     users = [f"process {pid} ({command})" for pid, command in store.remove(snapshot.home).items()]

@@ -1,9 +1,9 @@
-"""``envhub doctor``: what this host, or a server on another, can enforce, found out by doing it.
+"""``envhub doctor``: tests what this host, or a server on another host, can enforce.
 
-Each profile is tried with an environment of Gymnasium in a jail of its own, self-test
-included: nothing is concluded from versions or settings. A jail stops at the first layer that is
-missing, so the layers are also tried one by one, to name all of them at once. On macOS and Windows
-there are no jails but in containers: there the profile that is asked for is tried in one.
+It tries each profile with an environment of Gymnasium in a jail, self-test included, and concludes
+nothing from versions or settings. A jail stops at the first missing layer, so each layer is also
+tried alone, to name all missing ones at once. On macOS and Windows jails run only in containers, so
+there only the requested profile is tried, in a container.
 """
 
 from __future__ import annotations
@@ -60,11 +60,11 @@ class Trial:
     """The result of trying one profile.
 
     Attributes:
-        available: A jail under it ran.
-        layers: One mapping per layer: ``layer``, ``enforced``, ``detail``.
+        available: Whether a jail with this profile ran.
+        layers: A mapping for each layer: ``layer``, ``enforced``, ``detail``.
         first_step_s: Seconds from ``make_env`` to the first step's result.
-        problem: Why it is not available, and what to do.
-        code: The exit code for that.
+        problem: Why the profile is not available, and what to do.
+        code: The exit code for the problem.
     """
 
     profile: str
@@ -107,7 +107,7 @@ def doctor(
     """
     from envhub_sandbox.settings.policy import Policy
 
-    Policy(profile=profile)  # refuses a name that there is not, before anything is tried
+    Policy(profile=profile)  # raises for an unknown profile, before anything is tried
     if server is not None:
         purpose, module = "a server on another host", "envhub_sandbox.extras.remote"
         remote = extras.required(f"{module}.sandbox", "RemoteSandbox", purpose)
@@ -141,8 +141,8 @@ def doctor(
 
 @contextlib.contextmanager
 def _scratch_folder() -> Iterator[Path]:
-    """A folder for a repository and a cache: what is wrong with the caller's hides no layer.
-    Raises ``SandboxUnavailableError``: there is no place for one.
+    """Make a folder for a repository and a cache: a problem of the user's cache hides no layer.
+    Raises ``SandboxUnavailableError``: no temporary folder is writable.
     """
     from envhub_sandbox.system.folders import CACHE_VARIABLE
 
@@ -166,8 +166,8 @@ def _scratch_folder() -> Iterator[Path]:
 
 
 def _cache_problem(*, by_others: bool) -> str | None:
-    """Why the caller's cache is of no use, and what to do; None if it is.
-    ``by_others``: whether root's jails read it as another user: all but those with a private root.
+    """Say why the user's cache cannot be used, and what to do; None if it can.
+    ``by_others``: whether root's jails read it as another user, as they do without a private root.
     """
     from envhub_sandbox.system.folders import cache_root
 
@@ -189,7 +189,7 @@ def _cache_problem(*, by_others: bool) -> str | None:
 
 
 def host() -> dict[str, Any]:
-    """Facts about this machine that explain the rest."""
+    """Return facts about this machine that explain the results."""
     return {
         "system": f"{platform.system()} {platform.release()}",
         "machine": platform.machine(),
@@ -199,7 +199,7 @@ def host() -> dict[str, Any]:
 
 
 def engine() -> dict[str, Any]:
-    """The container engine that ``sandbox="docker"`` would use, or why there is none."""
+    """Describe the container engine of ``sandbox="docker"``, or say why there is none."""
     module = "envhub_sandbox.extras.docker.engines"
     try:
         container_engine = extras.required(module, "find_engine", "a container engine")(None)
@@ -214,20 +214,20 @@ def engine() -> dict[str, Any]:
 
 
 def resources(problem: str | None) -> dict[str, Any]:
-    """Bytes that are free: of memory, None where the kernel does not say, and for the cache."""
+    """Return the free bytes of memory, None if the kernel does not say, and of the cache's disk."""
     from envhub_sandbox.system.folders import cache_root
 
     disk: dict[str, Any] = {"folder": None, "free_bytes": None, "problem": problem}
-    with contextlib.suppress(SnapshotError):  # it is the problem
+    with contextlib.suppress(SnapshotError):  # ``problem`` already says it
         folder = next(path for path in (cache_root(), *cache_root().parents) if path.is_dir())
         disk |= {"folder": str(folder), "free_bytes": shutil.disk_usage(folder).free}
     return {"free_memory_bytes": free_memory_bytes(), "disk": disk}
 
 
 def probe() -> dict[str, Any]:
-    """The result of each layer alone: ``layers``, an ``apparmor_profile`` or None, and ``gpu``.
+    """Try each layer alone; return ``layers``, an ``apparmor_profile`` or None, and ``gpu``.
 
-    ``gpu`` are the device nodes that ``gpu=True`` grants, or None where that cannot be seen.
+    ``gpu``: the device nodes that ``gpu=True`` grants, or None if they cannot be determined.
     """
     from envhub_sandbox.sandboxes.process import worker_program
 
@@ -236,13 +236,13 @@ def probe() -> dict[str, Any]:
         done = subprocess.run(command, capture_output=True, timeout=_PROBE_S, check=True, cwd="/")
         results = json_format.loads(done.stdout)
     except (OSError, subprocess.SubprocessError, ValueError):
-        return dict(_NOTHING_PROBED)  # what the profiles say still stands
+        return dict(_NOTHING_PROBED)  # the trials of profiles remain valid
     kept = {name: results[name] for name in ("layers", "apparmor_profile")}
     return {**kept, "gpu": results["host"]["gpu"]}
 
 
 def examine(folder: str, profile: str) -> Trial:
-    """Run the idle environment under a profile, in the place that this platform has."""
+    """Run the idle environment with a profile, in this platform's sandbox."""
     from envhub_sandbox.factory.make_env import make_env
 
     begun = time.perf_counter()
@@ -261,7 +261,7 @@ def examine(folder: str, profile: str) -> Trial:
 
 
 def _print(trials: list[Trial], profile: str) -> None:
-    """The layers of the profile that was asked for, and of each other what it goes without."""
+    """Print the requested profile's layers, and the missing layers of every other profile."""
     facts = host()
     user = "root" if facts["root"] else "a plain user"
     out(f"{facts['system']} on {facts['machine']}, as {user}, {facts['python']}")
@@ -292,7 +292,7 @@ def _print(trials: list[Trial], profile: str) -> None:
 
 
 def _profile(trial: Trial) -> list[str]:
-    """A row of the table: whether it can be had, and which layers it goes without."""
+    """Return a row of the table: whether a profile is available, and its missing layers."""
     if not trial.available:
         return [trial.profile, "no", "", "", ""]
     lacks = [str(layer.get("layer")) for layer in trial.layers if not layer.get("enforced")]

@@ -1,7 +1,7 @@
 """``envhub inspect``: the environments that a repository makes, without playing them.
 
-With ``--static``: what it would do, read without running it. With ``--download``: for later use
-without network.
+With ``--static`` it reads the repository without running it. With ``--download`` it downloads
+repository and packages for later use without network.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def inspect(
 
 
 def describe_env(suite: str, task: Any, env: Any) -> dict[str, Any]:
-    """One environment as data. Trust: all of it is input from the worker."""
+    """Describe an environment as data. Trust: all of it is input from the worker."""
     from envhub_sandbox.play.episodes import autoreset_mode
 
     metadata = dict(getattr(env, "metadata", None) or {})
@@ -127,7 +127,7 @@ def _print(envs: list[dict[str, Any]], provenance: dict[str, Any], *, in_process
 
 
 def _check_options(context: typer.Context, *, static: bool, download: bool) -> None:
-    """Refuse options that would mean nothing. Raises ``UsageError``: there is one."""
+    """Raise ``UsageError`` if an option has no meaning with the others."""
     if static:
         means, why = _OF_ALL | _OF_STATIC | {"static"}, "with --static nothing runs"
     elif download:

@@ -1,4 +1,4 @@
-"""``envhub run``: roll an environment out, and say what happened."""
+"""``envhub run``: plays episodes of an environment and prints the results."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class _Run:
     make_env_s: float | None = None
 
     def execute(self) -> None:
-        """Run, print what there is to print even if it fails midway, and raise what failed."""
+        """Run and print the results, also those before an error; then raise the error."""
         try:
             if self.video is not None:
                 from envhub_sandbox.play.plays import check_target
@@ -168,7 +168,7 @@ class _Run:
             nonlocal add
             if add is not None:
                 add(frame_of(env))
-                if not counter.wants(0):  # now the last episode's last frame is in
+                if not counter.wants(0):  # the video has the last episode's last frame
                     add = None
             bar.update(counter)
 
@@ -243,7 +243,7 @@ class _Run:
             say(f"{len(stopped)} of {len(self.results)} tasks were stopped by --steps.")
 
 
-# --- what --verbose and --worker-output show on stderr -----------------------------------------
+# --- logs on stderr for --verbose and --worker-output ------------------------------------------
 
 
 class _SafeFormatter(logging.Formatter):
@@ -253,7 +253,7 @@ class _SafeFormatter(logging.Formatter):
 
 @contextlib.contextmanager
 def _logged(*, verbose: bool, worker_output: str | None) -> Iterator[None]:
-    """Show logs on stderr while it lasts."""
+    """Within this context, show logs on stderr."""
     from envhub_sandbox.system.log import MESSAGES, OUTPUT, ROOT
 
     with contextlib.ExitStack() as shown:
@@ -261,7 +261,7 @@ def _logged(*, verbose: bool, worker_output: str | None) -> Iterator[None]:
             handler = _show(shown, ROOT, "%(asctime)s %(message)s")
             handler.addFilter(lambda record: record.name not in (OUTPUT.name, MESSAGES.name))
             shown.callback(OUTPUT.setLevel, OUTPUT.level)
-            OUTPUT.setLevel(logging.INFO)  # else no jail's output is followed
+            OUTPUT.setLevel(logging.INFO)  # otherwise no jail's output is read
         if worker_output == "-":
             _show(shown, OUTPUT, "%(message)s")
         yield

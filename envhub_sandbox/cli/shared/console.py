@@ -1,11 +1,10 @@
 """The only module that writes to stdout and stderr; it prints strangers' texts as plain text.
 
-Control characters are escaped, and rich's markup is not read. Only in a terminal are long lines
-wrapped, below their beginning: a log has each as one line. CI systems obey what they find in a log:
-GitHub ``::name::`` at the beginning of a line, GitHub and Azure ``##[name]`` and ``##vso[name]``
-anywhere, GitLab ``section_start:``. ``guarded`` breaks all of these, also in warnings
-and in errors of the option parser. ``command`` is the only way around it. ``ProgressBar`` is on
-stderr, where that is a terminal.
+It escapes control characters and reads no markup of rich. It wraps long lines only in a terminal,
+so that a log has each on one line. CI systems execute commands that they find in a log: GitHub
+``::name::`` at the beginning of a line, GitHub and Azure ``##[name]`` and ``##vso[name]`` anywhere,
+GitLab ``section_start:``. ``guarded`` breaks all of these, also in warnings and in errors of the
+option parser; only ``command`` writes one. ``ProgressBar`` writes to stderr if that is a terminal.
 """
 
 from __future__ import annotations
@@ -35,12 +34,12 @@ if TYPE_CHECKING:
     from envhub_sandbox.play.episodes import EpisodeCounter
 
 _PLAIN_WIDTH = 120
-"""The columns without a terminal, for progress bars and boxes alone."""
+"""The columns of progress bars and boxes without a terminal."""
 _LINE, _LONGEST = 200, 2_000
 _WORD = 12
 """The columns of a line's first word: the kind of a fact, or the severity of a finding."""
 _NARROWEST = 20
-"""Columns of the last cell in a table, below which it is not wrapped."""
+"""The fewest columns into which the last cell of a table is wrapped."""
 GOOD, DOUBTFUL, BAD = "bold green", "bold yellow", "bold red"
 """The styles of a command's conclusions."""
 _MOST = 1 << 20
@@ -58,7 +57,7 @@ _TAIL = 32
 
 def neutralised(text: str, after: str = "") -> str:
     """Escape one character of each command in a text, so that no CI system obeys it.
-    ``after``: what stands in the same line already; it is no part of the result.
+    ``after``: the text before it on the same line, which the result does not include.
     """
 
     def broken(match: re.Match[str]) -> str:
@@ -86,7 +85,7 @@ class _SafeStream:
         return len(text)
 
     def writelines(self, lines: Sequence[str]) -> None:
-        """Write them one after the other."""
+        """Write lines one after the other."""
         for line in lines:
             self.write(line)
 
@@ -98,7 +97,7 @@ class _SafeStream:
 
 
 def _end_of_line(text: str) -> str:
-    """The end of the last line, which the next write may complete to a command."""
+    """Return the end of the last line, which the next write may complete to a command."""
     line = re.split(f"[{_BREAK}]", text)[-1]
     start = re.sub(rf"\A{_SPACE}", "", line)
     return start if start in ("", ":") else f"x{start[-_TAIL:]}"
@@ -106,8 +105,8 @@ def _end_of_line(text: str) -> str:
 
 @contextlib.contextmanager
 def guarded() -> Iterator[None]:
-    """Let CI systems obey nothing of what is written to stdout and stderr while it lasts. A
-    warning of Python is a line without the place in this package's code that gave it.
+    """Within this context, CI systems find no commands on stdout and stderr. A Python warning is a
+    line without the file and line that raised it.
     """
     before, warnings.showwarning = warnings.showwarning, _show_warning
     try:
@@ -125,12 +124,12 @@ def _show_warning(message: Warning | str, *_place: object, **_further: object) -
 
 
 def console(*, stderr: bool = False) -> Console:
-    """A console on stdout or stderr. Interprets no markup: texts may be a stranger's."""
+    """Make a console on stdout or stderr, without markup: texts may be a stranger's."""
     from rich.console import Console
 
     class PipeConsole(Console):
         def on_broken_pipe(self) -> None:
-            raise BrokenPipeError  # rich would exit by itself, with a code of its own
+            raise BrokenPipeError  # rich itself would exit, with another code
 
     stream = sys.stderr if stderr else sys.stdout
     return PipeConsole(
@@ -165,13 +164,13 @@ def show_below(text: str, margin: str = "  ") -> None:
 
 
 def _hanging(begin: str, text: str, *, stderr: bool = False) -> str:
-    """A line; in a terminal it is wrapped below the end of its beginning."""
+    """Return ``begin`` with ``text``; in a terminal, wrapped lines are indented below ``text``."""
     stream = sys.stderr if stderr else sys.stdout
-    # more columns than any line has where it is none
+    # without a terminal, more columns than any line has
     columns = shutil.get_terminal_size().columns if stream.isatty() else _MOST
     room = columns - len(begin)
     if len(text) > room >= _NARROWEST:
-        # a path or a command stays in one piece, to be copied
+        # keep a path or a command in one piece, so that a user can copy it
         lines = textwrap.wrap(text, room, break_on_hyphens=False, break_long_words=False)
         text = f"\n{' ' * len(begin)}".join(lines)
     return f"{begin}{text}".rstrip()
@@ -183,9 +182,9 @@ def show_rows(
     right: Collection[int] = (),
     styles: Mapping[int, str] | None = None,
 ) -> None:
-    """Print a table on stdout, a line each row, the first of which has the names of the columns.
-    In a terminal the last cell is wrapped below itself. Cells may be a stranger's; ``right`` are
-    columns of numbers, ``styles`` those of rows.
+    """Print a table on stdout. The first row has the names of the columns. In a terminal the last
+    cell is wrapped. Cells may be a stranger's texts. ``right``: the indices of right-aligned
+    columns; ``styles``: the style of a row by its index.
     """
     lines = [[*map(safe_line, row[:-1]), safe_line(row[-1], _LONGEST)] for row in rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
@@ -205,23 +204,23 @@ def command(line: str) -> None:
 
 
 def safe_text(text: object, limit: int = 16_384) -> str:
-    """Text that a terminal only prints: control characters escaped, length bounded."""
+    """Return a text that is safe in a terminal: control characters escaped, length bounded."""
     return printable(str(text), limit)
 
 
 def safe_line(text: object, limit: int = _LINE) -> str:
-    """``safe_text`` on one line, cut at its end."""
+    """Return ``safe_text`` on one line, cut to ``limit`` characters."""
     line = printable(str(text), limit=10 * limit).replace("\n", " ").replace("\t", " ")
     return line if len(line) <= limit else f"{line[: limit - 1]}…"
 
 
 _json_left: ContextVar[bool] = ContextVar("_json_left", default=False)
-"""Whether the user wants a JSON document that was not printed yet."""
+"""Whether the user wants a JSON document that has not been printed yet."""
 
 
 @contextlib.contextmanager
 def expects_json(arguments: Sequence[str]) -> Iterator[None]:
-    """Whether a command line has ``--json``, also where its parser refuses the rest of it."""
+    """Within this context, know if arguments have ``--json``, also if their parser rejects them."""
     token = _json_left.set("--json" in arguments)
     try:
         yield
@@ -230,16 +229,16 @@ def expects_json(arguments: Sequence[str]) -> Iterator[None]:
 
 
 def print_json_error(kind: str, message: str, code: int) -> None:
-    """Print an error as a JSON document, if the user wants one and none was printed yet."""
+    """Print an error as JSON, if the user wants JSON and no document has been printed yet."""
     if _json_left.get():
         print_json({"error": {"type": kind, "message": message, "exit_code": code}})
 
 
 def print_json(document: Mapping[str, Any]) -> None:
-    """Print one document on stdout, as JSON that every parser takes."""
+    """Print a document on stdout, as JSON that every parser accepts."""
     _json_left.set(False)
     text = json.dumps(plain(document), indent=2, allow_nan=False, ensure_ascii=True)
-    # what CI systems obey in the middle of a line can only stand in texts, where JSON has escapes
+    # commands of CI systems in the middle of a line are within strings, where JSON has escapes
     text = re.sub(r"#(?=#\w{0,16}\[)|_(?=(?:start|end):)", lambda match: _escaped(match[0]), text)
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()
@@ -250,7 +249,7 @@ def _escaped(char: str) -> str:
 
 
 def plain(value: Any) -> Any:
-    """A value for JSON: arrays become lists, infinite numbers and NaN null, the rest text."""
+    """Convert a value for JSON: arrays become lists, infinite numbers and NaN null, others text."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if hasattr(value, "tolist"):  # arrays and numpy's scalars
@@ -291,8 +290,8 @@ class ProgressBar:
 
     Args:
         quiet: Show nothing at all.
-        long_s: If stderr is no terminal, print a line about what takes so long, and again after
-            twice as many seconds; 0 prints none.
+        long_s: If stderr is no terminal, print a line about an activity after so many seconds, and
+            again each time the seconds have doubled; 0 prints none.
     """
 
     def __init__(self, *, quiet: bool, long_s: float = 0.0) -> None:
@@ -306,7 +305,7 @@ class ProgressBar:
         self._entered = contextlib.ExitStack()
 
     def begin(self, title: str, total: int | None = None) -> None:
-        """Show what begins; ``total`` in episodes, None where that is unknown."""
+        """Show an activity that begins; ``total``: its episodes, None if unknown."""
         self._what, self._total, self._next_s = title, total or 0, self._long_s
         self._begun = self._shown = time.monotonic()
         if self._progress is None:
@@ -316,7 +315,7 @@ class ProgressBar:
         self._task = self._progress.add_task(safe_line(title, 60), total=total, detail="")
 
     def update(self, counter: EpisodeCounter) -> None:
-        """Show how far it is; often called, seldom drawn."""
+        """Show the progress; draws at most every ``_EVERY_S`` seconds."""
         now = time.monotonic()
         if self._progress is None or self._task is None or now - self._shown < _EVERY_S:
             return

@@ -1,4 +1,4 @@
-"""Exit codes, and how errors reach the user: one paragraph on stderr, no traceback."""
+"""Exit codes, and the report of an error to the user: a paragraph on stderr, no traceback."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Exit(IntEnum):
     meaning: str
 
     def __new__(cls, code: int, meaning: str) -> Exit:
-        """A code with its meaning."""
+        """Make a code with its meaning."""
         member = int.__new__(cls, code)
         member._value_, member.meaning = code, meaning
         return member
@@ -55,11 +55,11 @@ class UsageError(EnvHubError):
 
 
 class ForeignError(EnvHubError):
-    """The repository's code, run in this process, raised what is in ``__cause__``."""
+    """The repository's code, run in this process, raised the exception in ``__cause__``."""
 
 
 def code_for(error: BaseException) -> Exit:
-    """The exit code for an error."""
+    """Return the exit code for an error."""
     if isinstance(error, KeyboardInterrupt):
         return Exit.INTERRUPTED
     if not isinstance(error, EnvHubError):
@@ -68,7 +68,7 @@ def code_for(error: BaseException) -> Exit:
     from envhub_sandbox import errors
 
     codes = {
-        Exit.DIFFERENT: (errors.LockDriftError,),  # before the error of which it is one
+        Exit.DIFFERENT: (errors.LockDriftError,),  # before LockError, its base class
         Exit.USAGE: (
             *(UsageError, errors.VideoError, errors.HubReferenceError, errors.PolicyError),
             *(errors.BundleError, errors.LockError),
@@ -84,7 +84,7 @@ def code_for(error: BaseException) -> Exit:
 
 
 def describe(error: BaseException) -> str:
-    """An error as text for a terminal: escaped, without tracebacks, with the end of the output."""
+    """Describe an error for a terminal: escaped, without traceback, with the end of the output."""
     if _is_full(error):
         file = getattr(error, "filename", None) or "what is printed"
         return safe_text(f"no space is left for {file}; free some, and try again")
@@ -100,14 +100,14 @@ def describe(error: BaseException) -> str:
 
 
 def _is_full(error: BaseException) -> bool:
-    """Whether a disk of the caller, or the caller's quota on it, is full."""
+    """Whether an error says that a disk, or the user's quota on it, is full."""
     full = (errno.ENOSPC, errno.EDQUOT)
     return isinstance(error, OSError) and error.errno in full and not isinstance(error, EnvHubError)
 
 
 @contextlib.contextmanager
 def reported(*, debug: bool) -> Iterator[None]:
-    """Turn whatever ends a command into a message on stderr and an exit code."""
+    """Turn an error that ends a command into a message on stderr and an exit code."""
     try:
         yield
         sys.stdout.flush()
@@ -119,7 +119,7 @@ def reported(*, debug: bool) -> Iterator[None]:
             print_json_error("KeyboardInterrupt", "interrupted", Exit.INTERRUPTED)
         raise typer.Exit(Exit.INTERRUPTED) from None
     except Exception as error:
-        # a repository's own pipe is not our output
+        # a repository's own broken pipe is an EnvHubError, not the end of our output
         if isinstance(error, BrokenPipeError) and not isinstance(error, EnvHubError):
             _discard_output()
             raise typer.Exit(Exit.PIPE) from None
@@ -131,7 +131,7 @@ def reported(*, debug: bool) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _ignoring_full_or_closed_output() -> Iterator[None]:
-    """A message that cannot be written changes no exit code: a pipe is closed, a disk is full."""
+    """Ignore errors of writing a message to a closed pipe or a full disk: keep the exit code."""
     with contextlib.suppress(OSError):
         yield
     _discard_output()
@@ -158,4 +158,4 @@ def _discard_output() -> None:
             with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         except ValueError:
-            pass  # it is closed
+            pass  # the stream is closed

@@ -11,7 +11,7 @@ _PACKAGES = ("gymnasium", "numpy", "huggingface_hub", "pyzmq", "msgpack", "image
 
 
 def versions() -> dict[str, str | int | None]:
-    """The versions of this package and its dependencies; None for a missing package."""
+    """Return the versions of this package and its dependencies; None for a missing package."""
     from envhub_sandbox import __version__
     from envhub_worker.protocol.messages import VERSION
 
@@ -21,7 +21,7 @@ def versions() -> dict[str, str | int | None]:
 
 
 def _installed(name: str) -> str | None:
-    from importlib import metadata  # brings the standard library's e-mail
+    from importlib import metadata  # late: it imports email
 
     try:
         return metadata.version(name)
@@ -40,10 +40,10 @@ _UNLIMITED = 1 << 60
 
 
 def free_memory_bytes(proc: Path = Path("/proc")) -> int | None:
-    """The bytes that are free or that the kernel can reclaim; None if it does not say.
+    """Return the bytes that are free or reclaimable; None if the kernel does not say.
 
-    A control group that we are in, or one around it, may have less left than the machine: that of
-    a container, or of a service.
+    The control group of this process, or one around it, may have fewer bytes left than the machine,
+    such as that of a container or of a service.
     """
     free = [_of_machine(proc / "meminfo"), *map(_of_group, _groups(proc / "self"))]
     return min((size for size in free if size is not None), default=None)
@@ -64,7 +64,7 @@ def _of_group(folder: Path) -> int | None:
 
 
 def _groups(process: Path) -> Iterator[Path]:
-    """The folders of the groups that count our memory, from our own to the top of what we see."""
+    """Yield the folders of the groups that count our memory, from our own to the top visible."""
     lines = [line.split(":", 2) for line in _text(process / "cgroup").splitlines()]
     own = {name: line[2] for line in lines if len(line) == 3 for name in line[1].split(",")}
     for kind, root, top in _mounts(process / "mountinfo"):
@@ -76,7 +76,7 @@ def _groups(process: Path) -> Iterator[Path]:
 
 
 def _mounts(mountinfo: Path) -> Iterator[tuple[str, str, Path]]:
-    """The version, the group and the folder of each mount of groups that may count memory."""
+    """Yield version, group and folder of each mount of groups that may count memory."""
     for line in _text(mountinfo).splitlines():
         left, _, right = line.partition(" - ")
         mount, source = left.split(" "), right.split(" ")

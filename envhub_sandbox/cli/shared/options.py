@@ -63,10 +63,10 @@ _Command = Callable[..., None]
 
 
 def with_options(*keys: str, **defaults: Any) -> Callable[[_Command], _Command]:
-    """Report what ends a command, and give it options.
+    """Decorate a command: report its errors, and add options.
 
-    These are ``--debug``, and options of ``make_env`` in place of a parameter ``make``, which gets
-    ``MakeOptions``. ``defaults`` are those that differ from ``make_env``'s.
+    The options are ``--debug``, and those of ``make_env`` in place of a parameter ``make``, which
+    gets ``MakeOptions``. ``defaults``: the defaults that differ from ``make_env``'s.
     """
     options = {OPTIONS[key].parameter: _parameter(key, keys, defaults) for key in keys}
 
@@ -89,7 +89,7 @@ def with_options(*keys: str, **defaults: Any) -> Callable[[_Command], _Command]:
                     arguments["make"] = MakeOptions(arguments.get("ref") or "", typed)
                 function(**arguments)
 
-        # what typer reads
+        # typer reads these two
         vars(command)["__signature__"] = inspect.Signature(
             [_keyword(name, each.default, each.annotation) for name, each in shown.items()]
         )
@@ -100,7 +100,7 @@ def with_options(*keys: str, **defaults: Any) -> Callable[[_Command], _Command]:
 
 
 def _keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
-    """A keyword-only parameter."""
+    """Make a keyword-only parameter."""
     kind = inspect.Parameter.KEYWORD_ONLY
     return inspect.Parameter(name, kind, default=default, annotation=annotation)
 
@@ -126,7 +126,7 @@ def _parameter(key: str, others: Sequence[str], defaults: Mapping[str, Any]) -> 
 
 
 def _completion(metavar: str) -> Callable[[], list[str]] | None:
-    """The values for a shell's completion: the parts of a metavar in lower case."""
+    """Return the values for a shell's completion: the parts of a metavar in lower case."""
     matches = [re.match(r"[a-z][a-z:/-]*", word) for word in metavar.split("|")]
     words = [match[0] for match in matches if match is not None]
     return words.copy if words else None
@@ -142,7 +142,7 @@ class MakeOptions:
     typed: Mapping[str, Any]
 
     def __getitem__(self, key: str) -> Any:
-        """An option as ``make_env`` takes it. Raises ``UsageError``: it cannot be read."""
+        """Convert an option for ``make_env``. Raises ``UsageError``: its text is invalid."""
         if key == "sandbox" and self.in_process:
             self._check_trust()
         reader, value = _READERS.get(key), self.typed[key]
@@ -176,7 +176,7 @@ class MakeOptions:
         return bool(self.typed["sandbox"] == "none")
 
     def arguments(self) -> dict[str, Any]:
-        """The arguments of ``make_env``. Raises ``UsageError``: an option cannot be read."""
+        """Return the arguments of ``make_env``. Raises ``UsageError``: an option is invalid."""
         arguments: dict[str, Any] = {"cfg": self.ref, "policy": {}, "limits": {}, "timeouts": {}}
         for key in self.typed:
             option, value = OPTIONS[key], self[key]
@@ -200,7 +200,7 @@ class MakeOptions:
 
     @contextlib.contextmanager
     def explained(self) -> Iterator[None]:
-        """Without a sandbox whatever is raised is the repository's, and its prints go to stderr."""
+        """Without a sandbox, raise ``ForeignError`` for the code's errors, and print to stderr."""
         try:
             with prints_on_stderr() if self.in_process else contextlib.nullcontext():
                 yield
@@ -214,8 +214,8 @@ class MakeOptions:
 def select_envs(
     envs: Mapping[str, Mapping[Any, Any]], suites: Sequence[str] | None, tasks: Sequence[str] | None
 ) -> list[tuple[str, Any, Any]]:
-    """``(suite, task, env)`` for each chosen environment; all where nothing is chosen.
-    Raises ``UsageError``: none fits; the text names what there is.
+    """Return ``(suite, task, env)`` for each chosen environment; for all if none is chosen.
+    Raises ``UsageError``: no environment matches; the text lists all suites and tasks.
     """
     every = [(suite, task, env) for suite, group in envs.items() for task, env in group.items()]
     chosen = [
@@ -231,7 +231,7 @@ def select_envs(
 
 
 def read_gpu(text: str | None) -> bool | list[int] | None:
-    """``all`` or indices. Raises ``UsageError``: it is neither."""
+    """Read ``all`` or indices. Raises ``UsageError``: the text is neither."""
     if text is None or text == "all":
         return None if text is None else True
     if not all(index.isdecimal() for index in text.split(",")):
@@ -246,8 +246,8 @@ def is_typed(context: typer.Context, name: str) -> bool:
 
 
 def read_env_kwargs(texts: Sequence[str] | None) -> dict[str, Any]:
-    """Keyword arguments from JSON objects and ``key=value`` pairs; later ones win.
-    Raises ``UsageError``: one is neither.
+    """Read keyword arguments from JSON objects and ``key=value`` pairs; later ones win.
+    Raises ``UsageError``: a text is neither.
     """
     values: dict[str, Any] = {}
     for text in texts or ():

@@ -18,12 +18,12 @@ _SHOWN_PACKAGES = ("gymnasium", "numpy")
 
 @dataclass(frozen=True, kw_only=True)
 class TaskResult:
-    """One task's rollout.
+    """The rollout of one task.
 
     Attributes:
-        suite, task: Its keys. Trust: input from the worker.
+        suite, task: The task's keys. Trust: input from the worker.
         autoreset_mode: ``"NextStep"``, ``"SameStep"``, ``"Disabled"`` or None.
-        video: The file that was written, or None.
+        video: The written file, or None.
     """
 
     suite: str
@@ -35,30 +35,30 @@ class TaskResult:
 
 
 def statistics(values: Sequence[float]) -> dict[str, float] | None:
-    """Mean, population standard deviation, minimum and maximum; None of nothing."""
+    """Return mean, population standard deviation, minimum and maximum; None without values."""
     import numpy as np
 
     if not values:
         return None
-    with np.errstate(all="ignore"):  # infinite returns are the environment's own business
+    with np.errstate(all="ignore"):  # an environment may return infinite rewards
         numbers = np.array(values, np.float64)
         return {name: float(getattr(numbers, name)()) for name in ("mean", "std", "min", "max")}
 
 
 def returns_of(rollout: Rollout) -> list[dict[str, float] | None]:
-    """Statistics of the returns, one per component of the reward."""
+    """Return statistics of the returns for each component of the reward."""
     components = zip(*(episode.returns for episode in rollout.episodes), strict=True)
     return [statistics(values) for values in components] or [None]
 
 
 def success_rate(rollout: Rollout) -> float | None:
-    """The share of successes among the episodes that state it; None if none does."""
+    """Return the share of successes among the episodes that report it; None if none does."""
     stated = [episode.success for episode in rollout.episodes if episode.success is not None]
     return sum(stated) / len(stated) if stated else None
 
 
 def task_document(result: TaskResult) -> dict[str, Any]:
-    """One task as data; ``return`` is a list where rewards are vectors."""
+    """Return a task's result as data; ``return`` is a list if rewards are vectors."""
     rollout = result.rollout
     returns = returns_of(rollout)
     return {
@@ -88,7 +88,7 @@ def task_document(result: TaskResult) -> dict[str, Any]:
 
 
 def print_results(results: Sequence[TaskResult]) -> None:
-    """A table with a row per task, and per component where rewards are vectors."""
+    """Print a table with a row for each task, and for each component if rewards are vectors."""
     with_success = any(success_rate(result.rollout) is not None for result in results)
     heads = ["suite / task", "episodes", "return", "min", "max", "length", "steps/s"]
     heads += ["success"] if with_success else []
@@ -132,7 +132,7 @@ def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:
     interpreter = provenance.get("interpreter") or {}
     if interpreter:
         shown = {*_SHOWN_PACKAGES}
-        if provenance["repo_type"] == "pypi":  # which says no version, or only in the reference
+        if provenance["repo_type"] == "pypi":  # its version is at most in the reference
             shown.add(re.split(r"[\[@#]", provenance["repository"])[0])
         text = _interpreter(interpreter, provenance.get("packages") or {}, shown)
         show("ran on", text)
@@ -158,7 +158,7 @@ def _interpreter(interpreter: dict[str, str], packages: dict[str, str], names: s
 
 
 def _confinement(provenance: dict[str, Any], in_process: bool) -> list[tuple[str, str]]:
-    """The rows about confinement, as ``envhub check`` prints them."""
+    """Return the rows about confinement, in the form of ``envhub check``."""
     if in_process:
         return [("confined by", "nothing: the code ran in this process")]
     if not provenance.get("layers"):
