@@ -24,7 +24,7 @@ _MOST = 500
 """Findings to keep: ten thousand files must not produce as many lines."""
 _SHOWN = 60
 _OF_EACH = 20
-"""Findings to keep for each check beyond that: no flood of notes hides an error."""
+"""Findings that each check may always keep: no flood of notes hides an error."""
 
 
 def _cause(error: EnvHubError) -> str:

@@ -41,7 +41,7 @@ _MOST_OF_A_FILE = 100
 _MOST = 20_000
 """Findings to keep: the limit of files is the same."""
 _OF_EACH = 20
-"""Findings to keep for each check beyond that."""
+"""Findings that each check may always keep."""
 _LONGEST_LINK = 1024
 _SHOWN_IGNORED = 10
 

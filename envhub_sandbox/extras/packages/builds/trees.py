@@ -32,12 +32,12 @@ from envhub_sandbox.system import folders
 from envhub_worker.protocol.text import size_text
 
 MAX_BYTES = 2 * 2**30
-"""Of all unpacked files of one source."""
+"""Bytes of all unpacked files of one source."""
 MAX_FILES = 50_000
 AT_ONCE = 2**20
 """The most bytes of one read: an extended header states its own length."""
 MAX_TABLE = 16 * 2**20
-"""Of a zip's table of contents."""
+"""Bytes of a zip's table of contents."""
 _PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """Compression methods of a zip: Python unpacks members of other methods whole, at any read."""
 _LEAST_HEADER = 30
@@ -252,7 +252,7 @@ def _size_of(header: tarfile.TarInfo, said: dict[str, str], title: str) -> int:
 
 
 def _said(kind: bytes, data: bytes, title: str) -> dict[str, str]:
-    """Returns the fields that an extended header sets for the next header; ignores global ones."""
+    """Returns an extended header's fields for the next header; a global one must not set them."""
     if kind in _LONG:
         name = data.partition(b"\0")[0].decode("utf-8", "surrogateescape")
         return {_LONG[kind]: name}

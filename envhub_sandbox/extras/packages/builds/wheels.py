@@ -97,7 +97,7 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
 
 
 def named(file: str, name: str, version: str) -> Version:
-    """Returns the version in a wheel's file name. Raises ``DependencyError``: it is another one."""
+    """Returns a wheel's version, by its file name. Raises ``DependencyError`` for another wheel."""
     try:
         distribution, number, _, _ = parse_wheel_filename(file)
         wanted = Version(version) if version else number
@@ -126,7 +126,7 @@ def _files(archive: zipfile.ZipFile) -> None:
     if len(members) > MAX_FILES or sum(member.file_size for member in members) > MAX_UNPACKED:
         raise not_as_expected(f"it holds more than {MAX_FILES} files or {size_text(MAX_UNPACKED)}")
     check_zip(members, "it")
-    # so that a folder collides with a file of the same name
+    # a folder counts as a file in it, so that it collides with a file of the folder's name
     names = (member.filename + "_" * member.is_dir() for member in members)
     check_listing_names([FileRecord(name, 0, "") for name in names], "it")
 

@@ -43,7 +43,7 @@ _BROKEN_BY = {
         "2022-12-18",
     ),
 }
-"""By pattern of an error: a requirement for an earlier release, and the day of the break."""
+"""Maps a pattern of an error to a requirement for an earlier release, and the day of the break."""
 _RECENT = timedelta(days=30)
 _MOST_DATES, _MOST_TEXT = 4, 65_536
 

@@ -131,7 +131,7 @@ def _cure(
 
 
 def _attempts(request: PackageRequest) -> Iterator[tuple[PackageRequest, Builder | None]]:
-    """Yields requests and their builders; last the request without guesses."""
+    """Yields requests and their builders; requests without guesses come last."""
     every = (*request.wanted, *(guess.wanted for guess in request.guesses))
     wheels_alone = BUILDER is None or not any(one.requirement.url for one in every)
     ways = [*([None] if wheels_alone else []), *([BUILDER] if BUILDER else [])]
