@@ -75,7 +75,7 @@ class Environment:
 
     @property
     def packages(self) -> Path:
-        """The folder for the path of an interpreter."""
+        """Returns the folder that an interpreter adds to its path."""
         return self.home / "packages"
 
     def answers_to(self, name: str) -> bool:

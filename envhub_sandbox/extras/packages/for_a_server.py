@@ -62,7 +62,7 @@ def main(words: Sequence[str] | None = None) -> int:
             uv.command()
             return 0
         given = [word.partition("=")[2] for word in words if word.startswith(_PIDFD)]
-        ended = int(given[0]) if given else None  # of the process which started this one
+        ended = int(given[0]) if given else None  # the pidfd of our parent
         order = json.load(sys.stdin)
         os.environ[CACHE_VARIABLE] = order["folder"]
         os.environ["UV_CACHE_DIR"] = str(_uv_cache(order))
@@ -159,7 +159,7 @@ def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     with _alone(Path(order["folder"])) as held:
         unfinished = Path(order["folder"], "unfinished")
         if unfinished.exists():
-            _clean(order)  # the process that made it was killed
+            _clean(order)  # its maker was killed
         _make_room(order)
         unfinished.touch()
         try:

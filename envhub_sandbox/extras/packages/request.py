@@ -266,7 +266,7 @@ def _guesses(snapshot: Snapshot, choice: Choice) -> tuple[Guess, ...]:
 
 
 def may_declare(root: Path, entry: str) -> bool:
-    """Whether it is worth reading what the files declare, which takes longer than this look."""
+    """Tells whether the files may declare packages: a quick look, since reading takes longer."""
     folders = dict.fromkeys(((root / entry).parent, root))
     if any((folder / name).is_file() for folder in folders for name in _DECLARE):
         return True

@@ -34,7 +34,7 @@ _LIST = ("ls-files", "-z", "-v", "--cached", "--others", "--exclude-standard")
 _CONVERSIONS = ("filter", "ident", "working-tree-encoding")
 """Attributes that make a folder's bytes differ from the commit's, apart from line ends."""
 _SHA256 = r"(?im)^\s*objectformat\s*=\s*\"?sha256"
-"""In a configuration; git here would misread such an index without noticing."""
+"""Marks SHA-256 ids in git's configuration; git would misread such an index without an error."""
 
 
 class _Repository(NamedTuple):

@@ -53,7 +53,7 @@ def _alarm(seconds: float, ring: Callable[[], None]) -> Iterator[None]:
 
         def rung(*_: object) -> None:
             if not left.is_set():
-                signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)  # also where another has sent it
+                signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)  # also after another's signal
             ring()
 
         before = signal.signal(signal.SIGALRM, rung)
