@@ -126,8 +126,10 @@ def _column(env: Any, name: str, values: Any, dtype: Any) -> Any:
             values = np.empty(0, object)
     shape, count = getattr(values, "shape", None), env.num_envs
     kind = getattr(getattr(values, "dtype", None), "kind", "f")
-    # others arrive as texts: a masked array, and what is an array for numpy alone
-    is_sent = hasattr(type(values), "__dlpack__") and not hasattr(values, "mask")
+    # Others arrive as texts: a masked array, and what is an array for numpy alone. Arrays of numpy
+    # before 1.22 have no ``__dlpack__``.
+    is_array = isinstance(values, np.ndarray) or hasattr(type(values), "__dlpack__")
+    is_sent = is_array and not hasattr(values, "mask")
     if not shape or shape[0] != count or kind not in "biuf" or not is_sent:
         returned = f"{batches.shown(values)} as {name}"
         raise _misfit(env, "step", f"returns {returned}, which have to be one number each, {count}")

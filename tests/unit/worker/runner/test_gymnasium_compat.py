@@ -2,8 +2,10 @@
 
 import functools
 from typing import Any
+from unittest.mock import Mock
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 from envhub_worker.runner import gymnasium_compat, manifest, tasks
@@ -104,3 +106,17 @@ def test_the_same_environment_twice_is_no_vector() -> None:
     [task] = tasks.tasks_of(only, 2, False, lambda: only)
     with pytest.raises(tasks.ResultError, match="the same Env object"):
         task.build(0, 2)
+
+
+def test_columns_of_an_old_numpy_are_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Arrays of numpy before 1.22 have no ``__dlpack__``; a masked array is refused there, too."""
+
+    def has(value: Any, name: str) -> bool:
+        return name != "__dlpack__" and hasattr(value, name)
+
+    monkeypatch.setattr(gymnasium_compat, "hasattr", has, raising=False)
+    env = Mock(num_envs=2)
+    step = (np.zeros((2, 3)), np.ones(2), np.zeros(2, bool), [False, True], {})
+    assert gymnasium_compat.step_result(env, step)[1] is step[1]
+    with pytest.raises(TypeError, match="as rewards"):
+        gymnasium_compat.step_result(env, (step[0], np.ma.ones(2), *step[2:]))
