@@ -249,7 +249,7 @@ class SharedMemoryLane(SlabLane):
             observation, rewards, ended, cut, own = checked
             return observation, rewards, ended, cut, own
         done = super().result(infos)
-        if self._asked == STEP:
+        if self._asked == STEP and infos is None:
             self.shards[0].note_checked()
         return done
 
