@@ -229,7 +229,7 @@ class ServedShard(ShardSlabs):
 
     def _array(self, dtype: np.dtype[Any], shape: tuple[int, ...], start: int) -> Any:
         # cast, not viewed as bool: a hostile byte of 2 would be neither True nor False
-        raw = _BYTE if dtype is _FLAG else dtype
+        raw = _BYTE if dtype == _FLAG else dtype
         if len(self._received) == 1:
             return np.ndarray(shape, raw, self._received[0], start).astype(dtype)
         array = np.empty(shape, raw)
