@@ -27,6 +27,7 @@ from envhub_worker.protocol.shared_memory.packets import packet_bytes, write_pac
 pytestmark = pytest.mark.short
 WAIT_S = 60
 SLOT = 1 << 16
+Asked = tuple[SlotRing, LaneShard]
 
 
 @pytest.fixture
@@ -44,6 +45,18 @@ def shard(observations: ObservationSlab) -> Iterator[LaneShard]:
     made = LaneShard(layout, observations.fd)
     yield made
     made.close()
+
+
+@pytest.fixture
+def asked() -> Iterator[Asked]:
+    """A step of an own vector that has no answer yet, and the ring that gets it."""
+    layout = slabs.message_layout(spaces.Box(-1, 1, (2,)), 2)
+    ring = SlotRing(1, SLOT, SLOT)
+    shard = LaneShard(layout, ring.fd)
+    shard.write_message(m.pack(m.Step(1, np.zeros((2, 2)))), (0, 0, 0), ring)
+    yield ring, shard
+    shard.close()
+    ring.close()
 
 
 def attack(shard: LaneShard, code: str) -> str:
@@ -256,12 +269,9 @@ def test_the_callers_results_are_its_own(shard: LaneShard, observations: Observa
     ids=["long", "endless", "boolean", "control"],
 )
 def test_the_answer_to_a_step_is_copied_before_it_is_looked_at(
-    size: int | None, spoiled: bytes, refusal: str
+    asked: Asked, size: int | None, spoiled: bytes, refusal: str
 ) -> None:
-    layout = slabs.message_layout(spaces.Box(-1, 1, (2,)), 2)
-    ring = SlotRing(1, SLOT, SLOT)
-    shard = LaneShard(layout, ring.fd)
-    shard.write_message(m.pack(m.Step(1, np.zeros((2, 2)))), (0, 0, 0), ring)
+    _, shard = asked
     packet = _packet(*map(bytes, m.pack(m.Value(np.ones(20_000, bool)))))
     assert len(packet) < SLOT
     length = len(packet) if size is None else size
@@ -278,8 +288,6 @@ def test_the_answer_to_a_step_is_copied_before_it_is_looked_at(
         answer = shard.answer()
         attack(shard, f"os.pwrite(observations, bytes({SLOT}), 0)")
         assert answer.value.all()
-    shard.close()
-    ring.close()
 
 
 @pytest.mark.parametrize(
@@ -295,13 +303,11 @@ def test_the_answer_to_a_step_is_copied_before_it_is_looked_at(
     ],
     ids=["control", "few", "bool", "list", "deep", "pickle", "none"],
 )
-def test_columns_of_a_step_are_numbers_and_texts_of_its_form(scalars: bytes, refusal: str) -> None:
+def test_columns_of_a_step_are_numbers_and_texts_of_its_form(
+    asked: Asked, scalars: bytes, refusal: str
+) -> None:
     """Whatever lies in them; booleans are made such, and all of it is copied."""
-    layout = slabs.message_layout(spaces.Box(-1, 1, (2,)), 2)
-    assert layout is not None
-    ring = SlotRing(1, SLOT, SLOT)
-    shard = LaneShard(layout, ring.fd)
-    shard.write_message(m.pack(m.Step(1, np.zeros((2, 2)))), (0, 0, 0), ring)
+    ring, shard = asked
     columns = struct.pack("QQ", slabs.COLUMNS, len(scalars))
     attack(shard, f"os.pwrite(reply, {columns!r}, {slabs.OUTCOME * 8})")
     with pytest.raises(RemoteProtocolError, match="impossible answer"):
@@ -336,8 +342,6 @@ def test_columns_of_a_step_are_numbers_and_texts_of_its_form(scalars: bytes, ref
         assert answer.info == {"log": {"loss": 0.5, "steps": 3}, "name": "run"}
         assert answer.terminations.tobytes() == answer.truncations.tobytes() == b"\x01\x01"
         assert answer.observation.tobytes() == b"\x02" * 16
-    shard.close()
-    ring.close()
 
 
 FRAMES = {
