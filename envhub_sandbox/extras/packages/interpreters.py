@@ -117,7 +117,7 @@ def find(python: str, declared: str = "", *, fetch: bool = False) -> Interpreter
 def others(declared: str, first: Interpreter) -> list[Interpreter]:
     """Returns the other fitting Python releases on this machine, the newest first."""
     interpreters = _others(SpecifierSet(declared) & _OLDEST)
-    return [version for version in interpreters if version.series != first.series]
+    return [other for other in interpreters if other.series != first.series]
 
 
 def _fetch(wanted: SpecifierSet) -> None:
@@ -149,7 +149,7 @@ def _others(wanted: SpecifierSet) -> list[Interpreter]:
     # the folder may be another user's; glob yields nothing for an unreadable folder
     paths = glob.glob(f"{glob.escape(root)}/versions/3.*/bin/python3")
     # pyenv's shims are no interpreters, but uv would start each of them every time
-    searched = os.environ.get("PATH", os.defpath).split(os.pathsep)
+    searched = map(os.path.normpath, os.environ.get("PATH", os.defpath).split(os.pathsep))
     search = os.pathsep.join(path for path in searched if os.path.basename(path) != "shims")
     try:
         answer = uv.run(

@@ -183,7 +183,7 @@ def test_no_interpreter_is_an_error_that_says_what_to_do(
         interpreters.find(asked, declared)
 
 
-@pytest.mark.parametrize(("folder", "is_asked"), [("bin", True), ("shims", False)])
+@pytest.mark.parametrize(("folder", "is_asked"), [("bin", True), ("shims/", False)])
 def test_shims_of_pyenv_are_not_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, is_asked: bool
 ) -> None:
@@ -192,7 +192,7 @@ def test_shims_of_pyenv_are_not_started(
     program.write_text(f"#!/bin/sh\necho > '{tmp_path}/asked'\n")
     program.chmod(0o755)
     monkeypatch.setenv("PYENV_ROOT", str(tmp_path))
-    monkeypatch.setenv("PATH", os.pathsep.join([str(program.parent), "/usr/bin", "/bin"]))
+    monkeypatch.setenv("PATH", os.pathsep.join([f"{tmp_path}/{folder}", "/usr/bin", "/bin"]))
     interpreters.others("", interpreters.own())
     assert (tmp_path / "asked").exists() == is_asked
 
