@@ -181,7 +181,7 @@ def fetched(url: str, commit: str, variables: Variables | None = None) -> Iterat
 
 
 def day_of(url: str, commit: str) -> str:
-    """Returns the author's date of a full commit: ``"2024-05-31"``. Raises as ``resolve``."""
+    """Returns the day on which a full commit was made: ``"2024-05-31"``. Raises as ``resolve``."""
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as folder:
         git = _Git(Path(folder), None, DAY_S)
         git.fetch(_checked(url), commit, "--filter=tree:0")  # without files, where a host can
