@@ -159,7 +159,7 @@ _ADVICE: tuple[tuple[str, dict[str, tuple[str, ...]], str], ...] = (
         "(render_mode='rgb_array'), or give the jail a display of its own, with {display}",
     ),
     (
-        r"No such file or directory: ['\"][^'\"\n]{0,4096}/packages/",
+        r"No such file or directory: ['\"](?=/)[^'\"\n]{0,4096}/packages/",
         {},
         "An installed package lacks this file as it was published: no argument brings it, but "
         "another release may have it",

@@ -221,6 +221,11 @@ def advised(kind: str, message: str, network: str = "none") -> str:
             "[Errno 2] No such file or directory: 'data/a.mat'",
             "in the repository",
         ),
+        (
+            "FileNotFoundError",
+            "[Errno 2] No such file or directory: 'data/packages/a.csv'",
+            "in the repository",
+        ),
     ],
 )
 def test_each_failure_names_what_brings_it(kind: str, message: str, named: str) -> None:
