@@ -84,7 +84,7 @@ def _source(frame: re.Match[str]) -> list[str]:
     return [line for line in (shown, caret if aligned and not frame["function"] else "") if line]
 
 
-# --- advice on downloads, sockets and windows ----------------------------------------------------
+# --- advice on what a jail lacks -----------------------------------------------------------------
 
 _HUB = (
     r"LocalEntryNotFoundError|OfflineModeIsEnabled|HF_HUB_OFFLINE|huggingface\.co|"
@@ -167,8 +167,8 @@ _ADVICE: tuple[tuple[str, dict[str, tuple[str, ...]], str], ...] = (
     (
         r"No such file or directory: ['\"](?![/~])[^'\"\n]{0,4096}[/.]",
         {},
-        "A relative path begins in the repository, which lacks this file: put it there. Of a "
-        "package, only a folder of your own with the file and an env.py can have it",
+        "A relative path begins in the repository, which lacks this file: put it there. "
+        "For a package, make a folder of your own with the file and an env.py",
     ),
 )
 """A pattern in an error's text, the policy's values that explain it, and the advice."""
@@ -176,7 +176,7 @@ _TEXT_CHARS = 65_536
 
 
 def add_reach_advice(error: EnvHubError, policy: Policy) -> bool:
-    """Add advice to an error of a download, a socket or a window, once; whether it is one."""
+    """Add advice to an error that has a row in ``_ADVICE``, once; returns whether it has one."""
     remote = error if isinstance(error, RemoteEnvError) else error.__cause__
     if "__notes__" in vars(error):
         return False
