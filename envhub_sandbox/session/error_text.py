@@ -143,14 +143,15 @@ _ADVICE: tuple[tuple[str, dict[str, tuple[str, ...]], str], ...] = (
         r"EOFError: EOF when reading a line",
         {},
         "It asked for input, and a jail has no terminal: its author puts the answer into a file "
-        "or a variable that the program reads instead; you give a variable with {variable}",
+        "or a variable that the program reads instead; you set the variable for this process, and "
+        "pass it on with {variable}",
     ),
     (
         _OSMESA,
         {},
         "This machine lacks the library that it draws by: install it (on Debian and Ubuntu: "
         "apt-get install libosmesa6 for MUJOCO_GL=osmesa, libegl1 for egl), or have it draw by "
-        "EGL, with {egl}",
+        "EGL: set MUJOCO_GL=egl for this process, and pass it on with {egl}",
     ),
     (
         _DISPLAY,
@@ -198,10 +199,10 @@ def _advice(text: str, policy: Policy, patterns: Collection[str] = ()) -> str:
             return sentence.format(
                 assets=option_name("assets", ["org/repo@COMMIT"]),
                 display=option_name("display", "virtual"),
-                egl=option_name("policy", {"environment": {"MUJOCO_GL": "egl"}}),
+                egl=option_name("environment", ["MUJOCO_GL"]),
                 extra=option_name("dependencies", {"extra": _to_install(text)}),
                 loopback=option_name("network", "loopback"),
-                variable=option_name("policy", {"environment": {"NAME": "VALUE"}}),
+                variable=option_name("environment", ["NAME"]),
             )
     return ""
 

@@ -1,7 +1,9 @@
 """What is added to an error: the author's own line, what a jail lacks, and what it was denied."""
 
+import ast
 import copy
 import pickle
+import re
 import sys
 from pathlib import Path
 
@@ -201,7 +203,7 @@ def advised(kind: str, message: str, network: str = "none") -> str:
         ("ImportError", "run `pip3 install -U a b[c]>=2` now", "{'extra': ['a', 'b[c]>=2']}"),
         ("ImportError", "pip install git+https://x/y", "{'extra': ['PACKAGE']}"),
         ("ImportError", "`pip install " + "a==1 " * 64, "{'extra': ['a==1']}"),  # not in 2**64 ways
-        ("EOFError", "EOF when reading a line", "policy={'environment': {'NAME': 'VALUE'}}"),
+        ("EOFError", "EOF when reading a line", "policy={'environment': ['NAME']}"),
         ("ImportError", "('Unable to load OpenGL library', 'OSMesa: cannot open')", "libosmesa6"),
         ("AttributeError", "'NoneType' object has no attribute 'glGetError'", "libosmesa6"),
         ("OSError", "[Errno 97] Address family not supported by protocol", "'loopback'"),
@@ -229,8 +231,11 @@ def advised(kind: str, message: str, network: str = "none") -> str:
     ],
 )
 def test_each_failure_names_what_brings_it(kind: str, message: str, named: str) -> None:
-    assert named in advised(kind, message)
-    assert advised(kind, message).count("\n") == 1
+    advice = advised(kind, message)
+    assert named in advice
+    assert advice.count("\n") == 1
+    for fields in re.findall(r"policy=(\{.*\})", advice):
+        Policy(**ast.literal_eval(fields))  # accepts what is advised
 
 
 @pytest.mark.parametrize(
