@@ -47,6 +47,8 @@ def test_one_look_does_for_all() -> None:
         assert held["files"] >= 3, "its standard streams"
         process.communicate(b"\n")
     assert usage_of(0, [], children) == {}
+    cycle = {1: [2, 4], 2: [3], 3: [2, 1], 4: [5]}  # pids reused between two looks at /proc
+    assert procfs.descendants(1, keep=[4], children=cycle) == [2, 3]
 
 
 def come_to(limits: Limits, usage: dict[str, int] = _NONE, *, own_root: bool = False) -> list[str]:

@@ -78,10 +78,12 @@ def descendants(
     ``children``: a recent result of ``all_children``; by default a new one.
     """
     children = all_children() if children is None else children
-    pids: list[int] = []
+    # A pid that is reused while all_children looks can be both above and below another one.
+    seen, pids = {root, *keep}, list[int]()
     pending = [root]
     while pending:
-        below = [pid for pid in children.get(pending.pop(), ()) if pid not in keep]
+        below = [pid for pid in children.get(pending.pop(), ()) if pid not in seen]
+        seen.update(below)
         pids += below
         pending += below
     return pids
