@@ -115,9 +115,12 @@ def test_subclasses_arrive_as_what_they_extend(value: object, plain: object) -> 
     assert_same(plain, through(value))
 
 
-def test_array_subclasses_arrive_as_arrays() -> None:
-    assert_same(np.arange(3), through(np.arange(3).view(type("Sub", (np.ndarray,), {}))))
+def test_array_subclasses_arrive_as_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
+    array = np.arange(3).view(type("Sub", (np.ndarray,), {}))
+    assert_same(np.arange(3), through(array))
     assert isinstance(through(np.ma.masked_array([1, 2], [0, 1])), RemoteObject)
+    monkeypatch.setitem(sys.modules, "numpy.ma", types.ModuleType("numpy.ma"))
+    assert_same(np.arange(3), through(array))
 
 
 def test_lone_surrogates_arrive_as_visible_escapes() -> None:

@@ -387,7 +387,7 @@ def write_numpy(encoder: Encoder, value: Any) -> object:
         return _write_scalar(encoder, value)
     if isinstance(value, np.ndarray):
         masked = sys.modules.get("numpy.ma")  # np.ma would import it, which takes 10 ms and 1 MB
-        if masked is not None and isinstance(value, masked.MaskedArray):
+        if isinstance(value, getattr(masked, "MaskedArray", ())):  # a thread may be importing it
             return encoder.unknown(value)
         return _write_array(encoder, np.asarray(value))
     if hasattr(type(value), "__array__") and hasattr(type(value), "__dlpack__"):
