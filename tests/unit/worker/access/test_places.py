@@ -67,7 +67,7 @@ def test_a_client_that_is_not_heard_of_loses_its_jails(idle_s: int, ended: list[
     sessions.connect(b"1", b"key", b"a")
     now[0] = 200.0
     sessions.connect(b"2", b"key", b"b")
-    places(idle_s, sessions, jails, uploads, None).tick()
+    places(idle_s, sessions, jails, uploads, frozenset()).tick()
     assert [number for number, _ in jails.ended] == ended
     assert [one.name for one in sessions.all()] == [b"b"] if ended else [b"a", b"b"]
     assert uploads.forget.called == bool(ended)
@@ -81,7 +81,7 @@ def test_a_client_that_fell_silent_gave_nothing_up(idle_s: int) -> None:
     sessions.keep(session, (7,))
     times = count(1)
     for _ in range(10):
-        places(idle_s, sessions, jails, MagicMock(), None).tick()
+        places(idle_s, sessions, jails, MagicMock(), frozenset()).tick()
     assert jails.ended == [(7, f"its client has sent nothing for {idle_s} s")]
 
 

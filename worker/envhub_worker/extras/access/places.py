@@ -92,7 +92,7 @@ class Places:
 
     Args:
         idle_s: How long the jails of a silent client live; 0 for ever.
-        open_wires: Returns the open connections; None if they are not counted.
+        open_wires: Returns the open connections.
 
     Attributes:
         lines: The clients that wait, by quota.
@@ -106,7 +106,7 @@ class Places:
         jails: Jails,
         uploads: Uploads,
         events: Events,
-        open_wires: Callable[[], frozenset[int] | None],
+        open_wires: Callable[[], frozenset[int]],
     ) -> None:
         self._quotas, self._idle_s = quotas, idle_s
         self._sessions, self._jails = sessions, jails
@@ -140,7 +140,7 @@ class Places:
                 check_jail(self._uses(key), more, self._quotas)
                 break
             except BusyError:
-                self._disconnect()
+                self._sessions.disconnect(self._open_wires())
                 # The asker's own session may look abandoned, too: a message may outlive its sender.
                 sessions = self._sessions.of_key(key)
                 gone = longest_gone([other for other in sessions if other.owner != asker.session])
@@ -211,15 +211,10 @@ class Places:
         A client that was only cut off loses nothing but a name. If it has jails, it keeps them for
         ``idle_s``, or until other clients of its key need the place.
         """
-        self._disconnect()
+        self._sessions.disconnect(self._open_wires())
         for session in self._sessions.all():
             if not session.connections and not self._jails.open_ones(session.owner):
                 self.drop(session, "its connections have ended")
-
-    def _disconnect(self) -> None:
-        wires = self._open_wires()
-        if wires is not None:
-            self._sessions.disconnect(wires)
 
     def end(self, session: Session, why: str) -> None:
         """End a session and its jails."""
