@@ -47,12 +47,13 @@ class MetricsPage:
         if path not in ("/metrics", "/healthz", "/readyz"):
             return 404, _TEXT, b"/metrics, /healthz, /readyz\n"
         published = self._published  # another thread replaces it
-        age_s, figures = (0.0, None) if published is None else published
+        published_at, figures = (0.0, None) if published is None else published
+        age_s = self._clock() - published_at
         wrong, right = "", "ready" if path == "/readyz" else "well"
         if figures is None:
             wrong = "it has only just been started"
-        elif self._clock() - age_s > STALE_S:
-            wrong = f"its loop has not run for {self._clock() - age_s:.0f} s"
+        elif age_s > STALE_S:
+            wrong = f"its loop has not run for {age_s:.0f} s"
         elif path == "/metrics":
             if self._rendered is None or self._rendered[0] is not figures:  # once a publication
                 self._rendered = figures, (200, *self._render(figures))
