@@ -138,7 +138,7 @@ class Sessions:
             session.held[jail] = self._clock()
 
     def unheld(self, session: Session, jail: int, idle_s: float) -> bool:
-        """Whether the client has held no jail for ``idle_s``; the first call starts the clock."""
+        """Whether the client has not held the jail for ``idle_s``; starts the clock if need be."""
         if session.held is None:
             return False
         return self._clock() - session.held.setdefault(jail, self._clock()) > idle_s
