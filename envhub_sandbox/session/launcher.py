@@ -428,7 +428,7 @@ class Launcher:
 
     def lives(self, loaded: LoadedJail) -> bool | None:
         """Whether a jail lives, as its server says; None if it does not answer.
-        One that does is not idle then.
+        The question restarts the time after which an idle jail ends.
         """
         try:
             look = m.ReadOutput(loaded.jail.number, "make_env")

@@ -31,7 +31,7 @@ _OURS = frozenset({"_vector", "_index", "_depth"})
 
 
 def _declared(name: str, vector_name: str) -> Any:
-    """A property that needs no request for the first one: the vector environment has its value."""
+    """A property that the vector environment answers without a request if ``_is_shown``."""
 
     def declared(env: SubEnvironment) -> Any:
         return getattr(env._vector, vector_name) if env._is_shown else env._get(name)
