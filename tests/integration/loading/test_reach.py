@@ -82,7 +82,7 @@ PIP = "[sys.executable, '-m', 'pip', 'install', 'no-such-one']"
         (f"urllib.request.urlopen({URL!r})", "assets=['org/repo@COMMIT'] names"),
         (f"subprocess.run(['git', 'clone', {URL!r}, '/tmp/x'], check=True)", "] names"),
         (f"subprocess.run({PIP}, check=True)", "dependencies={'extra': ['no-such-one']}"),
-        ("input()", "policy={'environment': {'NAME': 'VALUE'}}"),
+        ("input()", "policy={'environment': ['NAME']}"),
         ("subprocess.check_call('pip install -q no-such-one', shell=True)", "requirements.txt"),
         ("socket.create_server(('127.0.0.1', 0))", "policy={'network': 'loopback'}"),
         ("socket.create_connection(('localhost', 1))", "policy={'network': 'loopback'}"),
