@@ -1,9 +1,11 @@
 """What a lane carries: requests, several steps at once, what is too large; nothing is mixed up."""
 
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from envhub_sandbox import make_env
@@ -17,6 +19,7 @@ from tests.support import inside
 from tests.support.compare import assert_same
 from tests.support.in_process.interrupts import before_line
 from tests.support.objects.pipelines import changing, one_by_one, several_at_once
+from tests.support.processes import descendants
 from tests.support.repositories import STILL, write_repository
 from tests.support.started import started
 
@@ -243,3 +246,16 @@ def test_a_large_space_names_the_limit(tmp_path: Path) -> None:
     with pytest.raises(RemoteProtocolError, match=r"raise the limit.*elements"):
         make_env(folder, limits={"elements": 10_000}).close()
     make_env(folder, limits={"elements": 1_000_000}).close()
+
+
+def test_a_runner_that_sleeps_is_woken_once_for_a_step(talker: Path) -> None:
+    """With a process for each sub-environment, a second wake-up would be half of a step."""
+    steps, workers = 12, 4
+    with started(talker, workers, use_async_envs=True, num_workers=workers) as env:
+        processes = [psutil.Process(pid) for pid in descendants()]
+        before = sum(process.num_ctx_switches().voluntary for process in processes)
+        for _ in range(steps):  # fewer than before the first trial of waiting awake
+            env.step(np.zeros(workers, np.int64))
+            time.sleep(0.01)
+        after = sum(process.num_ctx_switches().voluntary for process in processes)
+        assert after - before < 1.5 * steps * workers

@@ -50,6 +50,7 @@ class Lane:
     Attributes:
         has_columns: Whether steps have a layout of their own.
         unsent: The frames of the last answer if the client must fetch it.
+        was_awake: Whether it has waited awake, so that its client may not have rung.
     """
 
     has_columns = False
@@ -66,6 +67,7 @@ class Lane:
     ) -> None:
         self.number = attach.env
         self.unsent: list[Any] = []
+        self.was_awake = False
         self._read, self._answer = read, answer
         self._raised = raised
         self._warned = warned
@@ -114,6 +116,7 @@ class Lane:
         """Poll for the next request without sleeping, for as long as the client says."""
         request, served = self._asked, self._served
         if self._spin_ns:
+            self.was_awake = True
             self._told[slabs.PARKED] = 0
             until = perf_counter_ns() + self._spin_ns
             while perf_counter_ns() < until:
@@ -123,6 +126,11 @@ class Lane:
         # request that came before the word was written is seen only here.
         self._told[slabs.PARKED] = 1
         return request[slabs.SEQUENCE] != served
+
+    def look_again(self) -> None:
+        """Serve a request whose client did not ring, some time after ``wake``."""
+        self.was_awake = False
+        self.serve()
 
     def serve(self) -> bool:
         """Serve a request if there is one; returns whether there was."""

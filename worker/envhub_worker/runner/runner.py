@@ -71,12 +71,12 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
                     runner.forget_lane(lane)
         else:
             for lane in bells.values():
-                lane.serve()
+                lane.look_again()
         if list(bells.values()) != list(runner.lanes.values()):
             bells = _hear(poller, bells, runner.lanes.values())
-        # A request may come while we go to sleep: its client may still read that we are awake, and
-        # not ring. So the first sleep is short, and its end looks at every lane.
-        timeout = _RECHECK_MS if ready and bells else None
+        # A request may come while a lane stops to wait awake: its client may still read that it
+        # does, and not ring. So the first sleep is short, and its end looks at every lane.
+        timeout = _RECHECK_MS if any(lane.was_awake for lane in bells.values()) else None
 
 
 def _hear(poller: select.poll, bells: Collection[int], lanes: Collection[Lane]) -> dict[int, Lane]:

@@ -23,15 +23,15 @@ class QuietLane:
     """A lane of which nothing is asked; its doorbell is one end of a socket pair."""
 
     def __init__(self, number: int) -> None:
-        self.number = number
+        self.number, self.was_awake = number, True
         client, own = socket.socketpair()
         self.client, self.bell = client, own.detach()
 
     def wake(self, *, alone: bool) -> bool:
         return bool(os.read(self.bell, 8))
 
-    def serve(self) -> bool:
-        return False
+    def look_again(self) -> None:
+        self.was_awake = False
 
     def close(self) -> None:
         os.close(self.bell)
