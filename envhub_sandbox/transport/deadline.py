@@ -11,7 +11,8 @@ sides: the client's wait for the reply and the runner's wait for the next reques
 One core is the client's. A shard with a core of its own may wait awake for work. A shard without
 one sleeps until a request comes, and runs on the client's core while the client sleeps. By itself
 the kernel tends to wake shards on the core of the process that woke them, so that they run one
-after the other. So ``Cores`` assigns each shard to a core.
+after the other. So ``Cores`` assigns each shard to a core. A single shard that sleeps is best
+there; one that the client waits awake for would never run there, so it avoids the client's core.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from __future__ import annotations
 import ctypes
 import os
 from time import monotonic
+
+from envhub_worker.protocol.shared_memory.words import AVOIDED
 
 _LONGEST_WAIT_MS = 24 * 3600 * 1000
 """The longest single wait; after it the caller waits again. Infinity has no milliseconds."""
@@ -222,6 +225,7 @@ class SpinChooser:
         self.budget_ns = min(max(usual, _MIN_BUDGET_NS), _MAX_BUDGET_NS) if spinning else 0
 
 
+_ANY = [0]
 _LOOK_EVERY = 64
 """Steps between two looks at where the client runs."""
 
@@ -247,8 +251,10 @@ class Cores:
         self._chosen = [0] * shards
         self._getcpu = getattr(ctypes.CDLL(None), "sched_getcpu", None)
 
-    def of_shards(self) -> list[int]:
-        """For each shard its core plus one, or 0 for any core."""
+    def of_shards(self, awake: bool) -> list[int]:
+        """For each shard its word ``CPU``; ``awake``: whether the client waits awake for it."""
+        if len(self._chosen) == 1 and not awake:
+            return _ANY
         self._until_look -= 1
         if self._until_look < 0:
             self._until_look = _LOOK_EVERY
@@ -258,9 +264,15 @@ class Cores:
                 self._chosen = place(len(self._chosen), self.awake, client, self._cpus)
         return self._chosen
 
+    def look_again(self) -> None:
+        """Look at once where the client runs: it may have moved to the core of a shard."""
+        self._until_look = 0
+
 
 def place(shards: int, awake: int, client: int, cpus: list[int]) -> list[int]:
-    """For each shard its core plus one; the first ``awake`` shards get cores of their own."""
+    """For each shard its word ``CPU``; the first ``awake`` shards get cores of their own."""
+    if shards == 1:  # not a certain core: single shards of many clients would share that
+        return [AVOIDED + 1 + client]
     others = [cpu for cpu in cpus if cpu != client]
     sleepers = [client, *others]
     return [

@@ -224,6 +224,13 @@ def lane(env: Any) -> SharedMemoryLane | None:
     return found if isinstance(found, SharedMemoryLane) else None
 
 
+def wait_awake(env: Any, budget_ns: int) -> None:
+    """Have its steps be waited for awake for so long, on the core that we are on now."""
+    shared: Any = lane(env)
+    shared._step_spin.budget_ns = budget_ns
+    shared._cores.look_again()
+
+
 def release_of_server(env: Any) -> Callable[[], None]:
     """What lets go of the server that it holds while it has no jail."""
     return session(env).lease._release_server

@@ -29,7 +29,6 @@ from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.shared_memory import slabs
 
 _NOTHING: list[Outcome] = []
-_ANY_CPU = [0]
 
 
 class ColumnLane(ColumnSteps, SharedMemoryLane):
@@ -90,8 +89,7 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
         self._spin = self._step_spin
         spin_ns = self._spin.budget_ns
         slot = self.observations.choose()
-        # the kernel chooses the core of a single shard
-        cpus = self._cores.of_shards() if len(self.shards) > 1 else _ANY_CPU
+        cpus = self._cores.of_shards(spin_ns > 0)
         # each shard starts as soon as its actions are written, while the next are still written
         for index, (shard, leaves, cpu) in enumerate(zip(self.shards, rows, cpus, strict=True)):
             shard.write(leaves, (slot, spin_ns if index < self._awake else 0, cpu))

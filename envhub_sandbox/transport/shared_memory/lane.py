@@ -184,7 +184,9 @@ class SharedMemoryLane(SlabLane):
             self._asked_ns = perf_counter_ns()
             self._spin = self._step_spin
             ring.choose()
-            if shard.write_actions(actions, (0, self._spin.budget_ns, 0), ring):
+            spin_ns = self._spin.budget_ns
+            cpus = self._cores.of_shards(spin_ns > 0)
+            if shard.write_actions(actions, (0, spin_ns, cpus[0]), ring):
                 shard.announce()
                 return
         super().send_step(actions, ahead=ahead)
@@ -205,8 +207,7 @@ class SharedMemoryLane(SlabLane):
         self._asked = operation  # interruption.md, rule 1: before anything is sent
         self._asked_ns = perf_counter_ns()
         self._spin = self._step_spin if operation == STEP else self._talk_spin
-        # the kernel chooses the core of a single shard
-        cpus = self._cores.of_shards() if len(self.shards) > 1 else [0]
+        cpus = self._cores.of_shards(self._spin.budget_ns > 0)
         for index, (shard, frames) in enumerate(zip(self.shards, packed, strict=True)):
             slot, ring = self._slot_for(operation, index)
             spin_ns = self._spin.budget_ns if index < self._awake else 0
@@ -363,6 +364,7 @@ class SharedMemoryLane(SlabLane):
             if not budget_ns or not shard.answered_until(until_ns):
                 if budget_ns:
                     self._spin.missed()
+                    self._cores.look_again()
                 if not shard.answered_before_death(self._watch, deadline):
                     return False
         return True

@@ -1,5 +1,6 @@
 """What a lane carries: requests, several steps at once, what is too large; nothing is mixed up."""
 
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError
 from envhub_sandbox.session.parts import worker_queue
-from envhub_sandbox.transport.deadline import Deadline, StepDeadline
+from envhub_sandbox.transport.deadline import Deadline, SpinChooser, StepDeadline
 from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, limits_for
 from envhub_worker.protocol.shared_memory import slabs
@@ -200,6 +201,42 @@ def test_what_comes_is_what_a_step_gives(tmp_path: Path, lane: str, count: int, 
     assert warned[0] == warned[1]
     assert len(warned[0]) > 10
 
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="this machine has a single core")
+@pytest.mark.parametrize("space", ["Box(0, 1, (2,), np.float32)", "Text(4)"])
+def test_a_single_runner_leaves_the_core_that_its_client_waits_on(
+    tmp_path: Path, space: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would never run there while the client waits awake. While it sleeps, it may: the kernel
+    wakes it fastest on that core."""
+    monkeypatch.setattr(SpinChooser, "measured", lambda *_: None)
+    monkeypatch.setattr(SpinChooser, "missed", lambda *_: None)
+    every, action = os.sched_getaffinity(0), np.zeros(1, np.int64)
+    folder = write_repository(tmp_path, STILL + _SPACE.replace("SPACE", space))
+    with started(folder, 1) as env:
+        for core in sorted(every)[:2]:
+            try:
+                os.sched_setaffinity(0, {core})
+                for budget_ns in (0, 10**5, 0):
+                    inside.wait_awake(env, budget_ns)
+                    for _ in range(3):  # where steps are messages, the third is like the second
+                        env.step(action)
+                    seen = [os.sched_getaffinity(pid) for pid in inside.pids(env)]
+                    assert (every - {core} in seen) == bool(budget_ns)
+            finally:
+                os.sched_setaffinity(0, every)
+
+
+_SPACE = """
+class Shown(Still):
+    observation_space = gym.spaces.SPACE
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, False, False, {}
+"""
 
 _ENV = """
 class Large(Still):

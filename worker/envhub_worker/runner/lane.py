@@ -246,8 +246,10 @@ class Lane:
 
     def _keep_to(self, cpu: int) -> None:
         self._cpu = cpu
+        avoided, core = divmod(cpu, slabs.AVOIDED)
+        every = range(os.cpu_count() or 1)
         with contextlib.suppress(OSError):  # it may have gone, or not be ours
-            os.sched_setaffinity(0, {cpu - 1} if cpu else range(os.cpu_count() or 1))
+            os.sched_setaffinity(0, {core - 1} if core and not avoided else {*every} - {core - 1})
 
     def infos(self) -> dict[Any, Any]:
         """Returns the last step's infos, which did not fit into the slab."""

@@ -30,7 +30,8 @@ SPIN = 16
 SLOT = 17
 """Request: the slot of the observation slab that the shard writes."""
 CPU = 18
-"""Request: one more than the number of the core that the shard should keep to; 0 for any."""
+"""Request: one more than the number of the core that the shard should keep to; 0 for any. With
+``AVOIDED`` added: that it should not run on."""
 CHANGES = 19
 """Request: grows with every change of ``SPIN``, ``SLOT``, ``CPU`` and the dtypes."""
 MESSAGE = 20
@@ -51,6 +52,8 @@ DTYPES = 32
 MAX_LEAVES = 64
 HEADER_WORDS = DTYPES + MAX_LEAVES
 HEADER_BYTES = HEADER_WORDS * 8
+
+AVOIDED = 1 << 32
 
 DONE, RAISED, FETCH, COLUMNS = 1, 2, 3, 4
 """Results and encoded infos are in the slab; an encoded ``RaisedException`` is; the infos must be
