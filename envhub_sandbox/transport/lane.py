@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from time import perf_counter_ns
 from typing import Any
 
@@ -155,7 +156,7 @@ class Lane:
     ) -> None:
         """Send each of some runners a packed message; ``replies`` returns their answers."""
         parts = list(zip(runners, packed, strict=True))
-        self._send(lambda: self.jail.relay(operation, parts), ahead=ahead)
+        self._send(partial(self.jail.relay, operation, parts), ahead=ahead)
 
     def _send(
         self, relay: Callable[[], int], unpack: Unpack | None = None, *, ahead: bool = False

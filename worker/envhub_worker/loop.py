@@ -27,6 +27,10 @@ _MAX_FAILURES = 100
 """Callbacks that fail one after the other."""
 
 
+def _nothing(*_: object) -> None:
+    pass
+
+
 class Loop:
     """Calls back when a descriptor or a ZeroMQ socket is ready, until ``stop``.
     ``failed``: called with the error of a callback; it must not raise.
@@ -37,8 +41,8 @@ class Loop:
         self._poller = zmq.Poller()
         self._callbacks: dict[Any, Callable[[], None]] = {}
         self._stopped = False
-        self._tick: Callable[[], None] = lambda: None
-        self._look: Callable[[], int | None] = lambda: None
+        self._tick: Callable[[], None] = _nothing
+        self._look: Callable[[], int | None] = _nothing
         self._failures = 0
 
     def tick(self, callback: Callable[[], None]) -> None:
@@ -68,7 +72,7 @@ class Loop:
         woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         signal.set_wakeup_fd(wakes)  # it gets the signals' numbers, a byte each
         for number in signals:
-            signal.signal(number, lambda *_: None)
+            signal.signal(number, _nothing)  # it only wakes the poll
 
         def signalled() -> None:
             for number in os.read(woken, _SIGNALS):

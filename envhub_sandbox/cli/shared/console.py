@@ -239,13 +239,13 @@ def print_json(document: Mapping[str, Any]) -> None:
     _json_left.set(False)
     text = json.dumps(plain(document), indent=2, allow_nan=False, ensure_ascii=True)
     # commands of CI systems in the middle of a line are within strings, where JSON has escapes
-    text = re.sub(r"#(?=#\w{0,16}\[)|_(?=(?:start|end):)", lambda match: _escaped(match[0]), text)
+    text = re.sub(r"#(?=#\w{0,16}\[)|_(?=(?:start|end):)", _escaped, text)
     sys.stdout.write(f"{text}\n")
     sys.stdout.flush()
 
 
-def _escaped(char: str) -> str:
-    return f"\\u{ord(char):04x}"
+def _escaped(match: re.Match[str]) -> str:
+    return f"\\u{ord(match[0]):04x}"
 
 
 def plain(value: Any) -> Any:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from functools import partial
 from time import perf_counter_ns
 from typing import Any
 
@@ -124,7 +125,7 @@ class ServedLane(ColumnSteps):
         self._asked_ns = perf_counter_ns()
         spin_ns, shards = self._spin.budget_ns, zip(self.shards, self._rows(actions), strict=True)
         payload = [shard.ask(leaves, spin_ns) for shard, leaves in shards]
-        self._send(lambda: self.jail.send_relay(self._step, payload), self._read)
+        self._send(partial(self.jail.send_relay, self._step, payload), self._read)
 
     def _read(self, index: int, frames: Frames) -> Outcome:
         return self.shards[index].read(frames)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ else:
     ) -> Callable[[type], type]:
         """Like ``dataclasses.dataclass(frozen=True)``; see the module."""
         assert frozen
-        return lambda cls: _recorded(cls, kw_only=kw_only, shown=repr)
+        return partial(_recorded, kw_only=kw_only, shown=repr)
 
 
 class About(NamedTuple):

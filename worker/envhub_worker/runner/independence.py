@@ -334,7 +334,7 @@ class Turns:
         for name in ("time", "monotonic", "perf_counter", "process_time"):
             setattr(time, f"{name}_ns", lambda: _EPOCH_NS + self._tick(1_000_000))
             setattr(time, name, lambda: (_EPOCH_NS + self._tick(1_000_000)) / 1e9)
-        time.sleep = lambda seconds: self._sleep(seconds)
+        time.sleep = self._sleep
         os.urandom = random._urandom = self._entropy  # type: ignore[attr-defined]
 
         def seeded(generator: random.Random, a: Any = None, *args: Any, **kwargs: Any) -> None:

@@ -131,7 +131,7 @@ def _packages() -> dict[str, str]:
             fields = _head_of(file)
             if "Name" in fields and "Version" in fields and len(versions) < MAX_NAMES:
                 versions.setdefault(fields["Name"], fields["Version"])
-    return dict(sorted(versions.items(), key=lambda pair: pair[0].lower()))
+    return {name: versions[name] for name in sorted(versions, key=str.lower)}
 
 
 def _metadata_in(folder: str) -> list[str]:

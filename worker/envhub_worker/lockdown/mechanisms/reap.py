@@ -19,10 +19,14 @@ _PAUSE_S = 0.001
 HANDLED = (signal.SIGCHLD, signal.SIGTERM)
 
 
+def _nothing(*_: object) -> None:
+    pass
+
+
 def child_signals(stop: Callable[..., None]) -> int:
     """Returns a descriptor that is readable when a child changes state or SIGTERM comes."""
     read, write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.signal(signal.SIGCHLD, _nothing)  # ignored, it would not wake
     signal.signal(signal.SIGTERM, stop)
     signal.set_wakeup_fd(write, warn_on_full_buffer=False)
     return read
@@ -35,7 +39,7 @@ def drain(fd: int) -> None:
             pass
 
 
-def reap(before: Callable[[int], None] = lambda pid: None) -> Iterator[tuple[int, int]]:
+def reap(before: Callable[[int], None] = _nothing) -> Iterator[tuple[int, int]]:
     """Reaps every ended child, adopted orphans included; returns pids and wait statuses.
     ``before``: called with each pid while that still belongs to the dead child.
     """

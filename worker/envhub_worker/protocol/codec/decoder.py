@@ -284,6 +284,14 @@ def _build_set(decoder: Decoder, head: _Head, items: list[Any]) -> set[object]:
     return result
 
 
+def _build_tuple(decoder: Decoder, head: _Head, items: list[Any]) -> object:
+    return tuple(items)
+
+
+def _build_frozenset(decoder: Decoder, head: _Head, items: list[Any]) -> object:
+    return frozenset(_build_set(decoder, head, items))
+
+
 def _build_range(decoder: Decoder, head: _Head, items: list[Any]) -> object:
     if [type(item) for item in items] != [int, int, int] or not items[2]:
         raise RemoteProtocolError("A range is not made of three integers.")
@@ -327,9 +335,9 @@ _READERS: dict[int, Callable[[Decoder, bytes], object]] = {
     wire.PICKLE_FRAME: _read_pickle_frame,
 }
 _BUILDERS: dict[int, Callable[[Decoder, _Head, list[Any]], object]] = {
-    wire.TUPLE: lambda decoder, head, items: tuple(items),
+    wire.TUPLE: _build_tuple,
     wire.SET: _build_set,
-    wire.FROZENSET: lambda decoder, head, items: frozenset(_build_set(decoder, head, items)),
+    wire.FROZENSET: _build_frozenset,
     wire.RANGE: _build_range,
     wire.SLICE: _build_slice,
     **dict.fromkeys((wire.OBJECTS, wire.TEXT_SCALAR, wire.TENSOR), _build_of_numpy),

@@ -109,7 +109,7 @@ class StepColumns:
 
         if item:
             return take, lambda scalars, found: kind(next(scalars))
-        return take, lambda scalars, found: next(scalars)
+        return take, _next_scalar
 
     def _leaf(self, value: Any) -> tuple[_Take, _Make]:
         name, array = "", value
@@ -125,7 +125,7 @@ class StepColumns:
         if self.nbytes > self._room:
             raise IrregularError
         take = partial(_take_tensor if name else _take_array, array.dtype, array.shape)
-        return take, lambda scalars, found: next(found)
+        return take, _next_array
 
     # --- writing and reading -------------------------------------------------------------------
 
@@ -183,6 +183,14 @@ def _packed(scalars: list[Any]) -> bytes:
     if len(packed) > INFO_BYTES:
         raise IrregularError
     return packed
+
+
+def _next_scalar(scalars: Iterator[Any], _: Iterator[Any]) -> Any:
+    return next(scalars)
+
+
+def _next_array(_: Iterator[Any], arrays: Iterator[Any]) -> Any:
+    return next(arrays)
 
 
 def _take_same(known: Any, value: Any, new: New) -> None:

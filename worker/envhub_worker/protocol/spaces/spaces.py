@@ -301,7 +301,10 @@ def _(space: spaces.Graph, depth: int) -> tuple[Any, ...]:
 
 
 if OneOf is not None:
-    _fields.register(OneOf, lambda space, depth: ("one_of", _encode_all(space.spaces, depth)))
+
+    @_fields.register(OneOf)
+    def _(space: Any, depth: int) -> tuple[Any, ...]:
+        return "one_of", _encode_all(space.spaces, depth)
 
 
 def _encode_child(space: Space, depth: int) -> dict[str, object]:
