@@ -96,6 +96,7 @@ def apparmor_profile() -> str:
 def try_layer(name: str, attempt: Callable[[], str]) -> dict[str, Any]:
     """Run ``attempt`` in a child process; return its result or the reason of its failure."""
     read, write = os.pipe()
+    # A process for each layer: what it enters cannot be left again.
     pid = os.fork()
     if pid == 0:
         os.close(read)

@@ -27,6 +27,8 @@ class Channel:
 
     def __init__(self, sock: socket.socket) -> None:
         self._socket = sock
+        # The waiting messages, with duplicates of their descriptors: the caller closes its own at
+        # once.
         self._unsent: collections.deque[tuple[bytes, tuple[int, ...]]] = collections.deque()
 
     @classmethod

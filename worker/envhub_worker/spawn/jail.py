@@ -93,12 +93,12 @@ class Jail:
         self.pidfd = -1
         self.output, output = os.pipe2(os.O_CLOEXEC)
         os.set_blocking(self.output, False)
-        self._folder = folder
-        self._group: Group | None = None
-        self._count = 0
-        self._runner_pidfds: dict[int, int] = {}
-        self._killed = False
-        self._report: list[dict[str, Any]] = []
+        self._folder = folder  # the writable folders of a jail without a mount namespace, else None
+        self._group: Group | None = None  # its control group; without one, init measures its memory
+        self._count = 0  # runners asked for so far; the number of the last one
+        self._runner_pidfds: dict[int, int] = {}  # by runner; closed when it has ended
+        self._killed = False  # also before there is an init: ``attach`` ends it then
+        self._report: list[dict[str, Any]] = []  # the jail's own layers, for each runner's report
         self._channel, control = Channel.pair()
         self.theirs = (control.detach(), output)
         if folder is not None:
@@ -163,6 +163,7 @@ class Jail:
         events = [event for message, fds in messages for event in self._translate(message, fds)]
         if ended:
             self._channel.close()
+            # Init has ended, and with it every runner: no exit of theirs is reported any more.
             self._close_pidfds(self._runner_pidfds)
         return events
 
@@ -205,6 +206,9 @@ class Jail:
 
     def kill(self) -> None:
         """End every process of the jail for certain. ``JailExited`` follows. Idempotent."""
+        # In this order. The end of the channel ends an init that has not been announced yet, for
+        # its pidfd is not here; ``attach`` signals it later. One that hangs in a call does not read
+        # its channel.
         self._killed = True
         self._channel.close()
         self._signal_init()

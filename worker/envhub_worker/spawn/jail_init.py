@@ -97,10 +97,10 @@ class Init:
     def __init__(self, channel: Channel, common: Common) -> None:
         self._channel = channel
         self._common = common
-        self._runners: dict[int, _Runner] = {}
-        self._listeners: set[int] = set()
-        self._denials: set[tuple[str, str]] = set()
-        self._running = True
+        self._runners: dict[int, _Runner] = {}  # by pid; those that are not reaped yet
+        self._listeners: set[int] = set()  # where the runners' filters ask what they do not decide
+        self._denials: set[tuple[str, str]] = set()  # reported already
+        self._running = True  # False once the channel has ended, or at SIGTERM
         self._poller = select.poll()
 
     def run(self) -> None:
@@ -125,7 +125,7 @@ class Init:
                 "this worker is installed without envhub_worker.extras.denials",
                 "Install the whole package, or leave out record_denials.",
             )
-        events, *joins = fds or [-1]
+        events, *joins = fds or [-1]  # in the order of ``Group.open``
         layers = plan(
             spec.confinement,
             machine=os.uname().machine,
@@ -169,6 +169,7 @@ class Init:
                     for pid, runner in self._runners.items():
                         if runner.status is not None and runner.status.fileno() == fd:
                             self._read_report(pid)
+            # Last in each round: what a runner has asked and reported comes before its exit.
             if wakeup in ready:
                 self._reap()
             if self._runners:
@@ -180,6 +181,7 @@ class Init:
             starting = [pid for pid, runner in self._runners.items() if runner.status is not None]
             over = self._watchdog.look(procfs.descendants(os.getpid(), starting))
             if over is not None:
+                # The reason is kept before the kill: an exit by SIGKILL does not tell whose it was.
                 for runner in self._runners.values():
                     runner.ended = runner.ended or over
                 reap.kill_descendants()
@@ -200,6 +202,8 @@ class Init:
         pid = os.fork()
         if pid == 0:
             runner_entry.run(self._jail, fds, theirs.fileno(), len(self._runners) + 1)
+        # Init's copies of the descriptors go after each fork, or the next runner would have them,
+        # too.
         self._watchdog.memory.ignore(fds)
         close_fds(fds)
         theirs.close()
@@ -217,6 +221,7 @@ class Init:
                 os.kill(pid, signal.SIGKILL)
 
     def _answer(self, listener: int) -> None:
+        # No caller is left under this filter: each runner has a listener of its own.
         if not notify.serve(listener, self._common.watched, self._note):
             self._poller.unregister(listener)
             self._listeners.discard(listener)
@@ -258,6 +263,8 @@ class Init:
         messages, ended = status.drain()
         for message, fds in messages:
             if "layer" in message:
+                # What one runner lacks, all lack: the whole jail fails, and the client learns what
+                # is missing.
                 raise LayerUnavailableError(**message)
             if "broker" in message:
                 self._listeners.update(fds)
@@ -272,6 +279,8 @@ class Init:
             runner.status = None
 
     def _reap(self) -> None:
+        # Each report is read just before its runner is reaped: it is sent with a pidfd, which needs
+        # the pid.
         ended = list(reap.reap(self._read_report))
         for pid, status in ended:
             runner = self._runners.pop(pid, None)
@@ -283,6 +292,8 @@ class Init:
 
     def _end_orphans(self, session: int) -> None:
         """End the orphans of a runner while others go on. Daemons end with the last runner."""
+        # A runner leads a session (``runner_entry.confine``), whose number its children have. Only
+        # a daemon begins a session of its own.
         for pid in procfs.descendants(os.getpid(), keep=self._runners):
             with contextlib.suppress(ProcessLookupError):
                 if os.getsid(pid) == session:
@@ -290,6 +301,7 @@ class Init:
 
     def _report_exit(self, runner: _Runner, status: int) -> None:
         fields = {"runner": runner.number, **process.exit_fields(status)}
+        # What init has decided comes first: the kernel's own kills look the same from here.
         reason, detail = runner.ended or self._reason(fields["signal"])
         self._channel.send({"event": "runner_exited", "reason": reason, "detail": detail, **fields})
 

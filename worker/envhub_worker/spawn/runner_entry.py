@@ -63,6 +63,9 @@ def _run(jail: JailContext, fds: list[int], init: Channel, runners: int) -> int:
     except LayerUnavailableError as error:
         init.send(error.to_wire())
         return 1
+    # In this order. Threads come after the confinement, which binds only the thread that asks for
+    # it and what that starts later. Then the report: the server takes the runner for confined from
+    # here on. The channel to init is closed before anything is read that a stranger wrote.
     blas.restore_threads(jail.common.set_blas_threads, runners)
     init.send({"report": [_SELF_TEST.to_wire()]})
     init.close()
@@ -128,6 +131,7 @@ def _forget_the_zygote(jail: JailContext) -> None:
     sys.argv = [jail.spec.entry]  # a repository may parse it; ours are not its arguments
     os.chdir(scratch.work)
     os.umask(0o022)
+    # The zygote may have cached what follows, and forks share their generators' state.
     tempfile.tempdir = None
     random.seed()
     numpy = sys.modules.get("numpy")
@@ -184,6 +188,8 @@ def _make_environment(environment: str, folder: str) -> None:
     for path, target in links.items():
         with contextlib.suppress(FileExistsError):
             os.symlink(target, path)
+    # The runners of a jail share their home and do this at once: each step gives the same result,
+    # and the last file appears as a whole.
     draft = f"{environment}/{os.getpid()}.draft"
     with open(draft, "w") as file:
         file.write(f"home = {os.path.dirname(base)}\ninclude-system-site-packages = false\n")

@@ -78,26 +78,29 @@ class Spawner:
                 ``"/a.py:function"``.
             ahead: A zygote process started earlier; used if it has the right arguments, else ended.
         """
-        self._jails: dict[int, Jail] = {}
-        self._count = 0
+        self._jails: dict[int, Jail] = {}  # by the number that messages to the zygote have
+        self._count = 0  # jails so far; the number of the last one
+        # The zygote's own, once it is ready: with namespaces it is a child of the started process.
         self._pidfd = -1
-        self._exited = False
+        self._exited = False  # the zygote has ended, and all jails with it
         if ahead is not None and not ahead.serves(runtime, confinement.environment):
             ahead.discard()
             ahead = None
         self._process = ahead or ZygoteProcess(runtime, runtime_dir, confinement.environment)
         self._folder = self._process.folder
-        self._user: int | None = None
+        self._user: int | None = None  # the user that root's jails become
         refusal = None
         try:
             self._user = user.choose()
         except LayerUnavailableError as error:
             refusal = error.to_wire()
+        # Holds the scratches where that user can reach them.
         self._apart: LockedFolder | None = None
+        # The parent of the jails' writable folders; None if they mount their own.
         self._scratches = self._make_scratches(confinement)
         self._cgroups = self._make_cgroups()
         self._channel = self._process.channel
-        self._in_use = _keep(runtime.packages)
+        self._in_use = _keep(runtime.packages)  # the lock that keeps the packages from removal
         root = self._folder / "root"
         root.mkdir()
         config = ZygoteConfig(
@@ -196,6 +199,9 @@ class Spawner:
         folder = None if self._scratches is None else self._scratches / f"jail-{self._count}"
         jail = Jail(spec, folder, self._user)
         try:
+            # In this order. The specification waits in init's own channel before there is an init.
+            # So init finds it at once, and the zygote, whose memory later jails inherit, never sees
+            # it.
             jail.describe(self._make_group(spec))
             self._channel.send({"op": "spawn", "id": self._count}, jail.theirs)
         except BaseException:

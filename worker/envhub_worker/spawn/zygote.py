@@ -129,8 +129,8 @@ class Zygote:
     def __init__(self, channel: Channel, common: Common) -> None:
         self._channel = channel
         self._common = common
-        self._inits: dict[int, int] = {}
-        self._running = True
+        self._inits: dict[int, int] = {}  # the jail's number by its init's pid
+        self._running = True  # False after SIGTERM, or at the end of the channel
 
     def run(self) -> None:
         """Serve until the channel ends or SIGTERM comes; then end everything below."""

@@ -81,10 +81,13 @@ class Tree:
         """Make the folder ``envhub_<random>_<name>``.
         Raises ``OSError``: the kernel refuses; use the watchdog.
         """
-        self._locks: list[int] = []
+        self._locks: list[int] = []  # one for each folder that we have made
         self.kind = hierarchy.kind
         own = f"{_PREFIX}{secrets.randbits(62)}_{name}"
         self._folders = [f"{folder}/{own}" for folder in hierarchy.folders]
+        # In this order. Version 2 passes controllers on only from a group without processes, so
+        # ours leave it first. Then the folder is made and locked, before a group in it could be
+        # taken for abandoned.
         _remove_abandoned(hierarchy.folders)
         if self.kind == "cgroup-v2":
             _step_aside(hierarchy.folders[0])
@@ -106,6 +109,7 @@ class Tree:
         """Remove the folder and every group in it; their processes must have ended."""
         for folder in self._folders[: len(self._locks)]:  # one that we did not make is another's
             _remove_tree(folder)
+        # Last: until then no other server may remove the same folder.
         while self._locks:
             os.close(self._locks.pop())
 
@@ -169,7 +173,7 @@ class Group:
 
     def __init__(self, kind: str, folders: Sequence[str], limits: Limits) -> None:
         self.kind = kind
-        self._folders = list(folders)
+        self._folders = list(folders)  # v1: of memory, of pids; v2: one for both
         for folder in folders:
             os.mkdir(folder)
         try:
@@ -265,7 +269,7 @@ class SurroundingLimit:
         """Whether the kernel has killed a process for this limit since the last call."""
         if self._count() <= self._seen:
             return False
-        self._seen += 1
+        self._seen += 1  # not the count: each kill explains one death
         return True
 
     def _count(self) -> int:

@@ -85,7 +85,7 @@ class MemoryWatch:
         self._limit = limit
         self._tmpfs = tmpfs
         self._own_network = own_network
-        self._foreign: set[tuple[int, int]] = set()
+        self._foreign: set[tuple[int, int]] = set()  # the client's slabs, by (device, inode)
 
     def ignore(self, fds: Iterable[int]) -> None:
         """Do not count these files, which belong to the client (slabs)."""
@@ -246,11 +246,13 @@ class Watchdog:
         self._limits = jail.spec.confinement.limits
         tmpfs = jail.scratch.temporary if jail.common.namespaced else None
         self._events = events
-        self._seen_kills = 0
+        self._seen_kills = 0  # kills by the kernel that explain a death already
         own_network = jail.common.namespaced and jail.common.config.network != "host"
         self.memory = MemoryWatch(self._limits.memory_bytes, tmpfs, own_network=own_network)
         self._folder = None if jail.common.namespaced else os.path.dirname(jail.scratch.home)
+        # When to look next; at once, since nothing is known yet.
         self._memory_due = time.monotonic()
+        # A mounted scratch has a quota, which the kernel keeps.
         self._disk_due = time.monotonic() if self._folder else float("inf")
 
     def seconds_left(self) -> float:

@@ -106,6 +106,8 @@ def _add(ruleset_fd: int, rule: LandlockRule, handled: int) -> None:
     except FileNotFoundError:
         return
     try:
+        # The kernel refuses a rule with a right that the ruleset does not handle, or that only
+        # folders have.
         access = rule.access & handled
         if not stat.S_ISDIR(os.fstat(path).st_mode):
             access &= _ON_FILES

@@ -24,7 +24,7 @@ _LONGEST = "/envhub-12345678/fds"
 
 class LockedFolder:
     """A new private folder with a lock; its owner may open it to others.
-    ``place``: its parent folder; by default the one for temporary files.
+    ``parent``: its parent folder; by default the one for temporary files.
     """
 
     def __init__(self, prefix: str, parent: Path | None = None) -> None:

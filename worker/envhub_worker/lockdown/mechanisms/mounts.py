@@ -49,7 +49,7 @@ _PROC_COVERED = ("/proc/sys/kernel/random/boot_id",)
 
 
 def enter_root(plan: RootPlan, root: str, copied: Sequence[str], user: int | None) -> None:
-    """Make ``place`` a root with the plan's files and the host's /proc; enter it, detach the old.
+    """Make ``root`` a root with the plan's files and the host's /proc; enter it, detach the old.
 
     Needs a mount namespace of our own; nothing propagates out of it.
 
@@ -58,6 +58,7 @@ def enter_root(plan: RootPlan, root: str, copied: Sequence[str], user: int | Non
             them.
         user: The user of the jails if it differs from this process's own, else None.
     """
+    # Before the first mount, or the host would see ours.
     kernel.mount("none", "/", "none", kernel.MS_REC | kernel.MS_PRIVATE)
     # The trees are cloned before the new root is mounted, which may lie below one of them.
     own = {} if user is None else _take_for(user, root_plan.outermost(copied))
@@ -77,9 +78,12 @@ def enter_root(plan: RootPlan, root: str, copied: Sequence[str], user: int | Non
     for path, target in plan.links.items():
         _link(root + path, target)
     os.chdir(root)
+    # With the same folder twice the old root comes to lie on top of the new one, and the unmount
+    # takes it away: no folder of the new root must hold it meanwhile.
     kernel.pivot_root(".", ".")
     kernel.unmount(".")
     os.chdir("/")
+    # Last: until now mount points were made in it.
     kernel.restrict_mount("/", kernel.ATTR_RDONLY)
 
 
@@ -184,6 +188,7 @@ def mount_skeleton(packages: str) -> None:
     """
     kernel.mount("skeleton", _SKELETON, "tmpfs", _PLAIN, "mode=755")
     _mirror_folders(packages, f"{_SKELETON}/packages")
+    # All jails of the zygote mount their overlays over it.
     kernel.restrict_mount(_SKELETON, kernel.ATTR_RDONLY)
 
 
@@ -207,6 +212,10 @@ def mount_jail(
     """
     hidden = [*roots, TEMPORARY, SHARED_MEMORY, HOME, WORK]
     buried = [path for path in trees if any(within(path, folder) for folder in hidden)]
+    # In this order. What must stay visible is taken first, since the next mounts hide all snapshots
+    # and whatever lies below temporary folders. It is put back upon them, with the links. Only then
+    # do the empty folders become read-only: the mount points were made in them. The overlays come
+    # last; they hold their upper folders, so the scratch itself can go out of sight.
     kept = _take((*buried, snapshot), 0)
     for folder in roots:
         kernel.mount("hidden", folder, "tmpfs", _PLAIN, "size=64k,nr_inodes=64,mode=755")

@@ -58,6 +58,8 @@ def mapped_to(user: int) -> int:
         process.die_with_parent(parent)
         with contextlib.suppress(OSError):
             kernel.unshare(kernel.CLONE_NEWUSER)
+        # It only lends its namespace: it waits until the parent, who may map any user, has written
+        # the map and holds a descriptor, and is then killed.
         signal.raise_signal(signal.SIGSTOP)
     try:
         os.waitpid(pid, os.WUNTRACED)
@@ -98,6 +100,8 @@ def fork_in_new_pid_namespace() -> int:
     kernel.unshare(kernel.CLONE_NEWPID)
     pid = os.fork()
     if pid:
+        # The kernel makes a pid namespace only below the caller's own. Without the way back every
+        # later jail would be refused.
         back = os.pidfd_open(os.getpid())
         kernel.setns(back, kernel.CLONE_NEWPID)
         os.close(back)

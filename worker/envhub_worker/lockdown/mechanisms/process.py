@@ -69,6 +69,7 @@ def has_no_new_privileges() -> bool:
 
 def drop_capabilities() -> None:
     """Empty the bounding, ambient, inheritable, permitted and effective sets."""
+    # Before the others: emptying the permitted set also takes the right to change the bounding set.
     empty_the_bounding_set()
     kernel.prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
     kernel.capset_none()

@@ -69,6 +69,7 @@ def remove_tree(path: str) -> None:
 def _empty(root: int) -> None:
     # A random name: the stranger could not have made a file of that name.
     prefix, moved = f".{secrets.token_hex(8)}", 0
+    # The stranger may have taken our own rights away.
     os.fchmod(root, 0o700)
     pending = _unlink_files(root)
     while pending:

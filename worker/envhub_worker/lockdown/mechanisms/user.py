@@ -83,6 +83,7 @@ def _has_name(uid: int) -> bool:
 
 def become(uid: int) -> None:
     """Become ``uid`` with that group only, for good. Call ``die_with_parent`` again afterwards."""
+    # In this order: each step needs a capability that the change of user, the last one, takes.
     process.empty_the_bounding_set()
     os.setgroups([])
     os.setresgid(uid, uid, uid)

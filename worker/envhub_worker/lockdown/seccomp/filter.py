@@ -60,12 +60,14 @@ def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.BpfInstru
     by_number = {numbers[name]: verdict for name, verdict in verdicts.items() if name in numbers}
     numbered = set(numbers.values())
     items: list[Item] = [
+        # First of all: another architecture's calls have other numbers.
         Do(bpf.LOAD, _ARCHITECTURE),
         Branch(bpf.JUMP_EQUAL, _AUDIT_ARCH[machine], None, _returning(policy.KILL_PROCESS)),
         Do(bpf.LOAD, _NUMBER),
     ]
     if machine == "x86_64":
         items.append(Branch(bpf.JUMP_GREATER_OR_EQUAL, _X32, _returning(policy.KILL_PROCESS), None))
+    # The answer of a kernel that is older than the call, after which programs use another one.
     items.append(Branch(bpf.JUMP_GREATER, highest, _returning(policy.ENOSYS), None))
     labels = [
         _label(n, by_number.get(n, policy.EPERM if n in numbered else policy.ENOSYS))

@@ -27,10 +27,10 @@ from envhub_worker.lockdown.seccomp.syscalls import NAMING, PRETENDED, c_int, sy
 from envhub_worker.lockdown.seccomp.targets import OTHER, is_another_target
 from envhub_worker.protocol.records import dataclass
 
-_RECEIVE = 0xC0502100
-_SEND = 0xC0182101
-_STILL_WAITS = 0x40082102
-_CONTINUE = 1
+_RECEIVE = 0xC0502100  # SECCOMP_IOCTL_NOTIF_RECV
+_SEND = 0xC0182101  # SECCOMP_IOCTL_NOTIF_SEND
+_STILL_WAITS = 0x40082102  # SECCOMP_IOCTL_NOTIF_ID_VALID
+_CONTINUE = 1  # SECCOMP_USER_NOTIF_FLAG_CONTINUE
 
 # struct seccomp_notif: id, tid, flags, then struct seccomp_data: call, arch, address, arguments.
 _REQUEST = struct.Struct("=QIIiIQ6Q")
@@ -100,6 +100,7 @@ def serve(listener: int, permitted: Collection[str], note: Callable[[Request], N
         answer = refusal(call)
     result, flags = (0, _CONTINUE) if answer == _PROCEED else (-answer, 0)
     with contextlib.suppress(OSError):
+        # The caller may have ended meanwhile: then nobody waits for an answer.
         fcntl.ioctl(listener, _SEND, _ANSWER.pack(identity, 0, result, flags))
     return True
 

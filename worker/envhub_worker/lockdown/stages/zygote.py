@@ -203,6 +203,8 @@ def _be_the_first_process() -> None:
     """Fork: the child continues as pid 1 of the new pid namespace; the parent waits for its end."""
     child = os.fork()
     if child:
+        # This parent only waits. If it held the channel, the server would not see the channel's
+        # end.
         process.close_all_but({2})
         _, status = os.waitpid(child, 0)
         code = os.waitstatus_to_exitcode(status)
