@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         return _serve_in(arguments)
     except BaseException as error:
-        if _client_has_gone(arguments):  # one that is there reads our log, and then removes it
+        if _client_has_gone(arguments):  # a client that runs reads our log, then removes the folder
             from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 
             remove_tree(str(arguments.runtime_dir))
@@ -58,8 +58,8 @@ def _client_has_gone(arguments: argparse.Namespace) -> bool:
 
 
 def _serve_in(arguments: argparse.Namespace) -> int:
-    ahead = _ahead(arguments)  # before anything heavy is imported: both are at it at once
-    gc.disable()  # as in the zygote: what is imported stays
+    ahead = _ahead(arguments)  # before the heavy imports, which both processes do at the same time
+    gc.disable()  # as in the zygote: imports leave no garbage
     from envhub_worker.lockdown.mechanisms.process import raise_file_limit
     from envhub_worker.server.server import Server
 
@@ -81,7 +81,7 @@ def _serve_in(arguments: argparse.Namespace) -> int:
     )
     server.stop_on(signal.SIGTERM, signal.SIGINT)
     if arguments.ready_fd is not None:
-        with contextlib.suppress(BrokenPipeError):  # a client that has gone: the loop sees it
+        with contextlib.suppress(BrokenPipeError):  # the client has ended, which the loop notices
             os.write(arguments.ready_fd, b"ready\n")
         os.close(arguments.ready_fd)
     if announced is not None:
@@ -101,5 +101,5 @@ def _ahead(arguments: argparse.Namespace) -> ZygoteProcess | None:
     try:
         granted = fixed_hash_seed(os.environ)
         return ZygoteProcess(runtime, arguments.runtime_dir, granted, ahead=True)
-    except OSError:  # opening a jail in that interpreter says why
+    except OSError:  # opening a jail in that interpreter fails likewise, and reports the reason
         return None

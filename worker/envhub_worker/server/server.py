@@ -110,11 +110,13 @@ class Server:
 
     def _listen(self, endpoint: str) -> zmq.Socket[bytes]:
         router = self._context.socket(zmq.ROUTER)
-        router.setsockopt(zmq.LINGER, 0)
+        router.setsockopt(zmq.LINGER, 0)  # an end waits for no client
+        # Checked before the allocation.
         router.setsockopt(zmq.MAXMSGSIZE, DEFAULT_LIMITS.frame_bytes)
-        router.setsockopt(zmq.RCVHWM, _RCVHWM)
-        router.setsockopt(zmq.ROUTER_HANDOVER, 0)
+        router.setsockopt(zmq.RCVHWM, _RCVHWM)  # of each client; then its own socket fills up
+        router.setsockopt(zmq.ROUTER_HANDOVER, 0)  # nobody takes over another one's routing id
         router.setsockopt(zmq.IPV6, "[" in endpoint)
+        # Before ``bind``: a peer that connects meanwhile would not be asked for its key.
         self._gate.secure(router, self._loop)
         router.bind(endpoint)
         return router
@@ -124,13 +126,15 @@ class Server:
         try:
             self._loop.run()
         finally:
-            if self._gate.drained():  # those who were refused last shall hear it
+            # In this order: strangers' processes end before anything else. The context ends only
+            # when its sockets are closed.
+            if self._gate.drained():  # clients that were refused last still get their replies
                 self._router.setsockopt(zmq.LINGER, _LAST_WORDS_MS)
             self._jails.close()
             self._gate.close()
             self._router.close()
             self._context.term()
-            remove_tree(str(self._runtime_dir))  # its owner may not be there any more
+            remove_tree(str(self._runtime_dir))  # the client, which would do it, may have ended
 
     # --- clients -------------------------------------------------------------------------------
 
@@ -160,7 +164,7 @@ class Server:
         except AnsweredError as early:
             self.reply(asker, early.reply)
         except Exception as error:
-            if not isinstance(error, ProtocolError):  # that is the client's mistake
+            if not isinstance(error, ProtocolError):  # which is an error of the client
                 self._gate.witness.failed(error)
             text = f"{type(error).__name__} on the server: {error}"
             text = shortage(error, "on the server") or text
@@ -170,7 +174,7 @@ class Server:
         """Answer an unreadable request, if its id is readable."""
         number = m.id_of(frame)
         if number is None:
-            return  # not our protocol
+            return  # without an id no answer reaches a request
         text = str(error) if isinstance(error, ProtocolError) else type(error).__name__
         refused = RefusedError("LocalProtocolError", f"the request cannot be read: {text}")
         self.reply(Asker(identity, number, b"", key), refused.reply)

@@ -61,8 +61,8 @@ class Sessions:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._sessions: dict[bytes, Session] = {}
-        self._of: dict[tuple[bytes, bytes], Session] = {}
+        self._sessions: dict[bytes, Session] = {}  # by owner
+        self._of: dict[tuple[bytes, bytes], Session] = {}  # by (routing id, key)
 
     def all(self) -> list[Session]:
         """Returns every session."""

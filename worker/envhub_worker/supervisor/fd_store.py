@@ -30,6 +30,7 @@ class FdStore:
 
     def __init__(self, path: str, pidfd_for: PidfdFor) -> None:
         self._pidfd_for = pidfd_for
+        # By jail and runner: sent on with the runner's ``Attach``, or closed with its jail.
         self._waiting: dict[tuple[int, int], list[int]] = {}
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(path)
@@ -65,7 +66,9 @@ class FdStore:
                 return
             assert isinstance(request, m.Deposit)
             self.put(request.jail, request.runner, fds)
-            fds = []
+            fds = []  # the store owns them now
+            # The client steps without the server from now on: the pidfd tells it when the jail has
+            # ended, or the runner of a jail that is kept.
             socket.send_fds(connection, [m.TAKEN], [pidfd])
         finally:
             close_fds(fds)

@@ -48,12 +48,13 @@ class JailEvents:
     ) -> None:
         self._loop = loop
         self._reply = reply
-        self._jails = jails
-        self._fds = fds
-        self._witness = witness
+        self._jails = jails  # the dict of ``Jails``, which adds to it
+        self._fds = fds  # deposits of jails and runners that end here are closed
+        self._witness = witness  # hears of openings and deaths
         self.deaths: Counter[str] = Counter()
-        self._steps = ServedSteps()
+        self._steps = ServedSteps()  # steps that runners owe the server itself
         loop.watch(self._steps.fileno(), self._steps.rung)
+        # Before the loop sleeps: an answer in slabs that the server polls wakes nobody.
         loop.look_by(self._steps.look)
         self._outer_limit = SurroundingLimit()
 
@@ -119,6 +120,7 @@ class JailEvents:
 
     def _runner_ready(self, entry: JailRecord, runner: int) -> None:
         link = entry.links[runner]
+        # The loop calls back for both directions with one function: the socket may take more, too.
         link.flush()
         try:
             answers = link.receive()
@@ -137,6 +139,7 @@ class JailEvents:
 
     def gather(self, pending: Pending) -> None:
         """Answer a ``Relay`` if each of its runners has answered or died."""
+        # One reply for all runners of a request: the client never has half of a step.
         replies = [frames for frames in pending.replies if frames is not None]
         if len(replies) == len(pending.replies):
             payload = [frame for frames in replies for frame in frames]

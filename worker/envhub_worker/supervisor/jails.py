@@ -88,10 +88,10 @@ class Jails:
         *,
         local: bool,
     ) -> None:
-        self._local = local
+        self._local = local  # whether all clients are this host's own user
         self._jails: dict[int, JailRecord] = {}
-        self._packet_ids = itertools.count(1)
-        self._counting = CountLimit()
+        self._packet_ids = itertools.count(1)  # of requests to runners, in all jails
+        self._counting = CountLimit()  # bounds how often a client has processes counted
         self._fds = FdStore(str(fd_path), self._pidfd_for)
         loop.watch(self._fds.fileno(), self._fds.accept)
         self._events = JailEvents(loop, reply, self._jails, self._fds, witness)
@@ -99,11 +99,13 @@ class Jails:
         self._loop = loop
         self._runtime_dir = runtime_dir
         self._readable_roots = readable_roots
-        self._ahead = ahead
+        self._ahead = ahead  # taken by the first jail that needs a zygote
+        # The one that was used longest ago is the first.
         self._spawners: dict[_Zygote, Spawner] = {}
 
     def close(self) -> None:
         """End every jail and zygote."""
+        # All jails are told to end before any is waited for, so they end at the same time.
         for entry in self._jails.values():
             self._events.kill(entry)
         for spawner in self._spawners.values():
@@ -204,6 +206,8 @@ class Jails:
         targets = _targets(entry, request, payload)
         if targets is None:
             raise RefusedError("LocalProtocolError", "the parts of Relay do not fit its frames")
+        # Every target is checked before the first is sent anything. A request that is refused half
+        # way would leave answers behind that nobody expects.
         for runner, frames in targets:
             if request.stepped and not _can_step(entry.links.get(runner), frames):
                 raise RefusedError("LocalProtocolError", "a runner has no slabs, or owes a step")
@@ -222,10 +226,11 @@ class Jails:
             try:
                 link.send(next(self._packet_ids), frames, (pending, index), fds)
                 if entry.idle is not None and fds:
+                    # The request and the reply slab.
                     entry.idle.watch(runner, [os.dup(fd) for fd in fds[:2]])
             finally:
                 close_fds(fds)
-            self._events.follow_writes(link)
+            self._events.follow_writes(link)  # the socket may not have taken all of it
         if entry.idle is not None:
             entry.idle.begin()
         if pending.dead:

@@ -39,8 +39,8 @@ class OutputTail:
         self.ended = False
         self._fd = fd
         self._limit = limit
-        self._kept = bytearray()
-        self._total = 0
+        self._kept = bytearray()  # up to twice the limit, so that few reads cut it
+        self._total = 0  # bytes that were read so far: the offset at the end of ``_kept``
 
     def fileno(self) -> int:
         """The descriptor, or -1 once it is closed."""
@@ -92,8 +92,9 @@ class IdleTimer:
 
     def __init__(self, limit_s: float) -> None:
         self.limit_s = limit_s
+        # Descriptors of (request, reply) by runner.
         self._slabs: dict[int, list[Sequence[int]]] = {}
-        self._seen: list[int] = []
+        self._seen: list[int] = []  # the sequence words at the last look
         self.begin()
 
     def begin(self) -> None:
@@ -122,6 +123,9 @@ class IdleTimer:
 
     def passed(self, busy: bool) -> bool:
         """Whether the jail was idle longer than its limit. ``busy``: a runner owes an answer."""
+        # A step in shared memory is no message to the server. But each request and each answer
+        # raises a sequence word: two equal and unchanged words mean that nobody has stepped since
+        # the last look.
         pairs = [pair for pairs in self._slabs.values() for pair in pairs]
         sequences = [_sequence(request) for request, _ in pairs]
         answered = [_sequence(reply) for _, reply in pairs]
@@ -181,7 +185,7 @@ class Opening:
     """An ``OpenJail`` or ``StartRunners`` some of whose runners have not started yet."""
 
     asker: Asker
-    waiting: set[int]
+    waiting: set[int]  # runners that have not started yet
     runners: tuple[int, ...]
     since: float = field(default_factory=monotonic)
 
@@ -192,8 +196,9 @@ class Pending:
 
     asker: Asker
     operation: str
+    # In the order of the request's parts; None: not answered yet.
     replies: list[list[Buffer] | None]
-    dead: set[int] = field(default_factory=set)
+    dead: set[int] = field(default_factory=set)  # indices of replies that are deaths
     since: float = field(default_factory=monotonic)
 
     def lost(self, index: int, death: m.Death) -> None:
@@ -211,22 +216,23 @@ class JailRecord:
         denied: The denied attempts of its processes, if it records them.
     """
 
-    number: int
+    number: int  # random, so that it tells nothing of other clients' jails
     name: str
     session: bytes
     jail: Jail
-    zygote: tuple[object, ...]
+    zygote: tuple[object, ...]  # the key of its spawner
     output: OutputTail
-    links: dict[int, RunnerLink] = field(default_factory=dict)
+    links: dict[int, RunnerLink] = field(default_factory=dict)  # streams of the live runners
+    # Of the live runners, once they are confined.
     pids: dict[int, int] = field(default_factory=dict)
-    opening: list[Opening] = field(default_factory=list)
-    closing: list[Asker] = field(default_factory=list)
-    kept: bool = False
-    idle: IdleTimer | None = None
-    lost: dict[int, m.Death] = field(default_factory=dict)
-    death: m.Death | None = None
-    released: bool = False
-    opened: bool = False
+    opening: list[Opening] = field(default_factory=list)  # requests that wait for runners
+    closing: list[Asker] = field(default_factory=list)  # who waits for the end of all processes
+    kept: bool = False  # goes on when a runner dies
+    idle: IdleTimer | None = None  # None: it may be idle for ever
+    lost: dict[int, m.Death] = field(default_factory=dict)  # deaths in a kept jail, by runner
+    death: m.Death | None = None  # set once; the answer to every later request
+    released: bool = False  # no process is left, and every descriptor is closed
+    opened: bool = False  # a first request for runners has been answered
     since: float = field(default_factory=monotonic)
     moved: tuple[int, int] = (0, 0)
     denied: list[str] = field(default_factory=list)

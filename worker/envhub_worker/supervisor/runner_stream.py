@@ -32,8 +32,9 @@ class RunnerLink:
     pending: collections.OrderedDict[int, Any] = field(default_factory=collections.OrderedDict)
     watched: bool = False
     slabs: ServedSlabs | None = None
-    sent: int = 0
-    received: int = 0
+    sent: int = 0  # bytes, of which the kept counts are in ``JailRecord.moved``
+    received: int = 0  # likewise
+    # Requests that the socket has not taken yet; the first may be sent in part.
     _unsent: collections.deque[memoryview] = field(default_factory=collections.deque)
 
     def __post_init__(self) -> None:
@@ -76,6 +77,7 @@ class RunnerLink:
         size = sum(map(len, buffers))
         self.sent += size
         if size < LARGE_BYTES:
+            # One copy costs less than many vectors; large arrays are sent from where they lie.
             buffers = [b"".join(buffers)]
         self._unsent += [memoryview(buffer).cast("B") for buffer in buffers if buffer]
         self.flush()

@@ -61,10 +61,13 @@ class ServedSlabs:
 
     def __init__(self, leaves: int, request_bytes: int, observation_bytes: int) -> None:
         self.shared_bytes = request_bytes + observation_bytes
+        # Only the server writes the request slab: the jail maps it read-only. The jail writes the
+        # other two.
         self._request, request = sealed_memfd("request", request_bytes, SEAL_FUTURE_WRITE)
         self._reply, reply = sealed_memfd("reply", words.REPLY_BYTES)
         observed, observations = sealed_memfd("observations", observation_bytes)
         self._observed = memoryview(observed)
+        # Bytes of words in a client's frame.
         self._words = (words.DTYPES - words.SPIN + leaves) * _WORD.size
         self._room = self._words + request_bytes - words.HEADER_BYTES
         self._runner_bell, self.bell = RunnerBell(), OwnBell()
@@ -79,10 +82,10 @@ class ServedSlabs:
             raise
         self._runner_bell.handed_over()
         self._asks, self._tells = words.words(self._request), words.words(self._reply)
-        self._sequence = self._known = 0
+        self._sequence = self._known = 0  # steps so far; bytes of columns that the client expects
         self.owner: Any = None
         self.awake_until = 0
-        self.vain = 0
+        self.vain = 0  # rings since the last answer
 
     def fits(self, frame: bytes) -> bool:
         """Whether a frame has the size of a client's half of the request slab."""
@@ -132,6 +135,7 @@ class ServedSlabs:
         size = self._known if outcome == words.COLUMNS else min(length, words.INFO_BYTES)
         first = head + self._reply[words.INFOS : words.INFOS + size]
         observed = self._observed
+        # Joining copies, but saves a frame; from some size on the copy costs more.
         if len(observed) <= LARGE_BYTES:
             return owner, [first + observed]
         starts = range(0, len(observed), _CHUNK_BYTES)

@@ -28,8 +28,8 @@ class CountLimit:
 
     def __init__(self, now: Callable[[], float] = monotonic) -> None:
         self._now = now
-        self._left = float(_AT_ONCE)
-        self._seen = now()
+        self._left = float(_AT_ONCE)  # counts that may be made at once; refilled with time
+        self._seen = now()  # when it was refilled last
 
     def children(self) -> procfs.Children | None:
         """Returns the children of each process on this machine; None if asked too often."""
