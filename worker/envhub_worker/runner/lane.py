@@ -82,14 +82,16 @@ class Lane:
             os.close(fd)
         os.set_blocking(self.bell, False)
         self._slot_bytes = observations // attach.slots
-        self._message = slabs.HEADER_BYTES
-        self._requested = memoryview(self._request)
-        self._asked = slabs.words(self._request)
-        self._told = slabs.words(self._reply)
-        self._told[slabs.PARKED] = 1
+        self._message = slabs.HEADER_BYTES  # offset of a message in the request slab
+        self._requested = memoryview(self._request)  # frames of messages are views of it
+        self._asked = slabs.words(self._request)  # the header that the client writes
+        self._told = slabs.words(self._reply)  # the header that we write
+        self._told[slabs.PARKED] = 1  # until the first request
+        # The requests that were served, and the client's wishes as they were read last.
         self._served = self._changes = self._cpu = self._spin_ns = 0
         self._step: tuple[int, Any] = 0, None  # ``WRITTEN`` of a step, and its actions in the slab
         self._columns: tuple[int, StepColumns | None] = 0, None  # and of which step they are
+        # Results without columns in a row; bytes of the last scalars.
         self._missed = self._scalars = 0
         self._offers_at = 1  # misses in a row
 
@@ -97,6 +99,8 @@ class Lane:
         """Silence the doorbell and serve; if ``alone``, go on while requests come quickly. Returns
         False if the client has closed its end, so that the doorbell cannot ring again.
         """
+        # In this order: a request that comes while we serve rings anew, so its ring must not be
+        # read here.
         rung = True
         with contextlib.suppress(BlockingIOError):
             rung = bool(os.read(self.bell, 8))
@@ -200,8 +204,8 @@ class Lane:
 
     def _request_of(self, length: int) -> m.Message:
         count, (known, actions) = self._asked[slabs.WRITTEN], self._step
-        if known == count:
-            return m.Step(self.number, actions.copy())
+        if known == count:  # the client has only written new actions into its last message
+            return m.Step(self.number, actions.copy())  # an environment may keep its action
         start = self._message
         frames = read_packet(self._requested[start : start + length], DEFAULT_LIMITS)
         request = self._read(frames)
@@ -282,9 +286,9 @@ class ColumnLane(Lane):
         self._layout = layout
         self._env = env
         self._assemble = slabs.assembler(env.single_action_space)
-        self._codes: list[int] = []
-        self._takes: list[Callable[[], Any]] = []
-        self._pairs: Pairs = []
+        self._codes: list[int] = []  # dtype codes of the actions, as they were read last
+        self._takes: list[Callable[[], Any]] = []  # reads one leaf each, by these codes
+        self._pairs: Pairs = []  # the last step's infos, in case the client fetches them
         self._writer = InfoWriter(self._reply, slabs.INFOS, layout.count, pack, env.joined)
         self._move(attach.start, observed)
 
@@ -376,11 +380,13 @@ class InfoWriter:
         self._pack = pack
         self._joined = joined
         self._integers: Sequence[bool] = ()
+        # The schema that the client knows too: keys and classes of each info, and views of the slab
+        # for the values and for the masks. None: the next infos go encoded.
         self._keys: list[Any] | None = None
         self._types: list[type] = []
         self._rows: list[Any] = []
         self._masks: list[Any] = []
-        self._fresh = False
+        self._fresh = False  # whether encoded infos lie where the columns do
 
     def write(
         self, pairs: Pairs, integers: Sequence[bool] = (), *, encoded: bool = False

@@ -122,14 +122,15 @@ class Runner:
         self._snapshot = snapshot
         self._entry = entry
         self._tasks: dict[tuple[str, Any], Task] = {}
-        self._envs: dict[int, Any] = {}
+        self._envs: dict[int, Any] = {}  # by the client's number
+        # By the same number, once asked for.
         self._generators: dict[int, generators.Generators] = {}
         self._play_bytes = play_bytes
-        self._stage = ""
+        self._stage = ""  # where an exception is said to have been raised
         self.warned = WarningLog()
         self.watches = Watches()
-        self.lanes: dict[int, Lane] = {}
-        self.descriptors: list[int] = []
+        self.lanes: dict[int, Lane] = {}  # by the environment's number
+        self.descriptors: list[int] = []  # that came with the last packet, for an ``Attach``
 
     def answer(self, packet: Packet) -> list[Any]:
         """Returns the reply's frames, with warnings and changes in front of them."""
@@ -199,6 +200,7 @@ class Runner:
         self._stage = "import"
         make_env = loader.import_entry(self._snapshot, self._entry, _scratch())
         self._stage = "make_env"
+        # Gymnasium's vector classes are stood in for: nothing is built before it is used.
         with standing_in():
             result = loader.call_make_env(make_env, request)
 
@@ -389,6 +391,8 @@ class Runner:
 
     def close(self, request: m.Close) -> m.Message:
         """``VectorEnv.close``."""
+        # In this order: whatever the repository's own ``close`` does, the environment is forgotten
+        # by then.
         env = self._envs.pop(request.env, None)
         self._generators.pop(request.env, None)
         self.watches.forget(request.env)

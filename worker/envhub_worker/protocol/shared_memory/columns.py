@@ -50,11 +50,12 @@ class StepColumns:
     """
 
     def __init__(self, values: Sequence[Any], room: int) -> None:
-        self._scalars: list[type] = []
+        self._scalars: list[type] = []  # classes, in the order of the columns
+        # Of each array: shape, dtype, offset in a slot, and its tensor's dtype by name, or "".
         self._arrays: list[tuple[tuple[int, ...], np.dtype[Any], int, str]] = []
         self.nbytes, self._room, self._parts = 0, room, 0
-        self._copies: dict[int, list[Callable[[], Any]]] = {}
-        self._views: dict[int, list[Any]] = {}
+        self._copies: dict[int, list[Callable[[], Any]]] = {}  # by the slot's start; for reading
+        self._views: dict[int, list[Any]] = {}  # likewise, for writing
         try:
             self._fields = [self._part(value) for value in values]
         except RecursionError as error:
@@ -133,6 +134,7 @@ class StepColumns:
         """Write arrays into the slot at ``start``; returns the scalars, packed.
         Raises ``IrregularError``: these results have another form; nothing was written.
         """
+        # All values are looked at before the first is written: a slot never holds half a step.
         new: New = [], []
         for (take, _), value in zip(self._fields, values, strict=True):
             take(value, new)
@@ -169,6 +171,7 @@ class StepColumns:
             return [make(scalars, taken) for _, make in self._fields]
         with UNTRUSTED:
             read = msgpack.unpackb(packed, strict_map_key=False)
+            # The worker fills in values; how many there are and of which classes is known already.
             if type(read) is not list or list(map(type, read)) != self._scalars:
                 raise RemoteProtocolError("the worker wrote other scalars than it had announced")
             scalars = iter(read)

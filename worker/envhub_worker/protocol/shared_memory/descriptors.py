@@ -49,6 +49,7 @@ def sealed_memfd(name: str, size: int, further_seals: int = 0) -> tuple[mmap.mma
     file = io.FileIO(os.memfd_create(f"envhub-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING), "r+")
     file.truncate(size)
     mapped = mmap.mmap(file.fileno(), size)
+    # Last: the file has its size by now, and ``SEAL_FUTURE_WRITE`` spares the map that exists.
     fcntl.fcntl(file, _ADD_SEALS, _SIZE_SEALS | further_seals)
     return mapped, file
 
