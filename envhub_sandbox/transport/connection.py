@@ -105,14 +105,15 @@ class WorkerConnection:
         limits: WireLimits = DEFAULT_LIMITS,
         far: FarServer | None = None,
     ) -> None:
-        self._owner = OwnerProcess()
+        self._owner = OwnerProcess()  # a fork must not use the connection
         self._limits = limits
         self._ids = itertools.count(1)
         self._socket = _context().socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, limits.frame_bytes)
-        self._socket.setsockopt(zmq.RCVHWM, 64)
+        self._socket.setsockopt(zmq.LINGER, 0)  # a close waits for nobody
+        self._socket.setsockopt(zmq.MAXMSGSIZE, limits.frame_bytes)  # checked before the allocation
+        self._socket.setsockopt(zmq.RCVHWM, 64)  # replies that wait here; others wait at the server
         self._far = far
+        # Before ``connect``: it has the socket prove its key, and hears of lost connections.
         self._link = None if far is None else far.link(self._socket, endpoint)
         self._socket.connect(endpoint)
         self._process_fd = process_fd
@@ -121,17 +122,21 @@ class WorkerConnection:
         self._poller.register(process_fd, zmq.POLLIN)
         if self._link is not None:
             self._poller.register(self._link.monitor, zmq.POLLIN)
+        # Unanswered requests to another host by id, to be sent again over a new connection: the
+        # number of the connection that each went over, and its frames.
         self._sent: dict[int, tuple[int, list[Buffer]]] = {}
         if self._link is not None:
             self._link.awaited = self._sent
+        # The last message, encoded.
         self._packed: tuple[m.Message | None, list[Buffer]] = (None, [])
-        self._latest: Buffer = b""
-        self._arrived: dict[int, _Received | EnvHubError] = {}
+        self._latest: Buffer = b""  # the header of the last reply, whoever waited for it
+        self._arrived: dict[int, _Received | EnvHubError] = {}  # read, but not received yet
+        # Requests whose replies are kept if another reply is waited for.
         self._kept: set[int] = set()
         self.torn = False
-        self._compression = ""
+        self._compression = ""  # agreed on with a server on another host
         self.patience_s = 0
-        self.stale_replies = 0
+        self.stale_replies = 0  # replies that nobody waited for any more
         self.sent_bytes = 0
         self.received_bytes = 0
 
@@ -208,6 +213,9 @@ class WorkerConnection:
                 self._kept.discard(request_id)
                 MESSAGES.debug("< %d %s", request_id, type(reply).__name__)
                 return reply, payload
+            # The server does not know this connection: the client said Hello on an earlier one, or
+            # to an earlier server. The same request follows the new Hello, under the id that the
+            # caller waits for.
             _, unanswered = self._sent.pop(request_id)
             self.hello(deadline)
             self._send(request_id, unanswered)

@@ -74,7 +74,7 @@ class Request:
         self.frames = self.sent = frames
         self.bounds = bounds
         self.plain = plain
-        self._kept: list[list[bytes]] | None = None
+        self._kept: list[list[bytes]] | None = None  # made when they are first needed
 
     def kept(self) -> list[list[bytes]]:
         """Copies of the frames; the frames of large values are views of memory that may change."""
@@ -296,6 +296,7 @@ class JailHandle:
 
     def ask_to_close(self) -> Callable[[Deadline], None]:
         """The first half of ``close``; returns the second, which waits for the jail's end."""
+        # Before the request: an ended jail's output cannot be read any more.
         self.before_end()
         request: int | None = None
         try:
@@ -346,6 +347,7 @@ def open_jail(
         opened = expect_reply(reply, m.JailOpened)
         runners = _runners(opened, request.runners)
         report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
+        # Named in keep-alives from now on, or a server on another host would end it.
         client.hold(opened.jail)
         return JailHandle(client, opened.jail, runners, report, limits)
     except EnvHubError:

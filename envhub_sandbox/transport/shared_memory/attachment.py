@@ -36,7 +36,7 @@ class Attachment:
     def __init__(self, path: str, jail: int, process_fd: int) -> None:
         self._path = path
         self._jail = jail
-        self._pidfds: dict[int, int] = {}
+        self._pidfds: dict[int, int] = {}  # by shard; we own them
         self.watch = Watch()
         self.watch.death(process_fd)
 

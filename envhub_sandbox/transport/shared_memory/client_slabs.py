@@ -111,24 +111,28 @@ class ShardSlabs:
     def __init__(self, layout: slabs.Layout, request: Any, reply: Any) -> None:
         self.layout = layout
         self._request, self._reply = request, reply
-        self._asks = slabs.words(request)
-        self._tells = slabs.words(reply)
-        self._columns: Schema = []
+        self._asks = slabs.words(request)  # the header that we write
+        self._tells = slabs.words(reply)  # the header that the runner writes: read each word once
+        self._columns: Schema = []  # of the infos that came encoded last
+        # Those infos, if they are one dict per sub-environment.
         self._own: dict[Any, Any] | None = None
+        # By leaf and dtype: the dtype's code, and the leaf's area in the slab as an array of it.
         self._views: dict[tuple[int, Any], Any] = {}
-        self._codes = [_UNKNOWN] * len(layout.actions)
-        self._wishes: Wishes | None = (0, 0, 0)
-        self._told = False
+        self._codes = [_UNKNOWN] * len(layout.actions)  # as they stand in the slab
+        self._wishes: Wishes | None = (0, 0, 0)  # as they stand in the slab
+        self._told = False  # whether the last request was a message
         self._dtype: Any = None  # of the last actions, where these are one array
         self._only: Any = None  # the slab as such an array
         self._answers = memoryview(reply)[slabs.ANSWER : slabs.ANSWER + slabs.INFO_BYTES]
+        # Where the answer to it comes; None: the reply slab.
         self._answer_slots: SlotRing | None = None
         self.told_bytes = self.answer_bytes = 0
+        # Derived from the last answer that was offered.
         self._step_columns: StepColumns | None = None
         self._form: StepColumns | None = None  # of the last answer
-        self._checked_form: StepColumns | None = None
+        self._checked_form: StepColumns | None = None  # a form that the manifest was compared with
         self._actions: Any = None  # the slab as the actions of a step that is a message
-        self._told_frames: Frames = []
+        self._told_frames: Frames = []  # of the last message, until its actions are noted
 
     def write(self, leaves: Sequence[Any], wishes: Wishes) -> None:
         """Write a shard's actions."""
@@ -277,6 +281,8 @@ class ShardSlabs:
         return message
 
     def _derive_columns(self, message: m.Message, room: int) -> None:
+        # 0 until the columns exist: if this is interrupted, the runner sends no columns that we
+        # lack.
         self._asks[slabs.DERIVED] = 0
         with suppress(IrregularError):
             self._form = self._step_columns = StepColumns(m.values_of(message), room)
@@ -370,10 +376,10 @@ class LaneShard(ShardSlabs):
         super().__init__(layout, asks, tells)
         self._runner_bell, self.bell = RunnerBell(), OwnBell()
         self._ring = self._runner_bell.ring
-        self._slab_files = [request, reply]
+        self._slab_files = [request, reply]  # ours until the runner has its own
         bells = [self._runner_bell.theirs, self.bell.fileno()]
         self.fds = [request.fileno(), reply.fileno(), observations, *bells]
-        self.sequence = 0
+        self.sequence = 0  # requests so far
 
     def handed_over(self) -> None:
         """Close our copies of the runner's descriptors; the maps keep the memory alive."""
@@ -384,6 +390,9 @@ class LaneShard(ShardSlabs):
     def announce(self) -> None:
         """Tell the runner that a request is written; ring its doorbell if it sleeps."""
         self.sequence += 1
+        # In this order. The word comes after what it announces, which the runner reads as soon as
+        # it sees it. The runner sets its parked word and then looks for a request once more
+        # (``runner.lane``), so it sees this request or we see that it sleeps.
         self._asks[slabs.SEQUENCE] = self.sequence
         if self._tells[slabs.PARKED]:
             self._ring()

@@ -52,7 +52,7 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
         )
         slots = [self.observations] * len(layouts)
         super().__init__(layouts[0], self.observations, relay, layouts, slots, attachment)
-        self._steps = 0
+        self._steps = 0  # so far, for ``traffic``
         self._step_bytes = sum(one.action_bytes for one in layouts), observed.batch_bytes
 
     @classmethod

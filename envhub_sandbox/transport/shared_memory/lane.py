@@ -72,15 +72,15 @@ class SharedMemoryLane(SlabLane):
         self.shards = [LaneShard(layout, ring.fd) for layout, ring in pairs]
         self._attachment = attachment
         self._watch = attachment.watch
-        self._asked = BY_SERVER
+        self._asked = BY_SERVER  # the operation whose answer the slabs get, or this
         results, manifest = self.declared, self.declared.manifest
         # the other workers of the same environment may be on this machine
         workers = -(-manifest.num_envs // results.count)
         may_spin = _ORDERED_STORES and workers < len(own_cpus())
-        self._spin = self._step_spin = SpinChooser(may_spin)
+        self._spin = self._step_spin = SpinChooser(may_spin)  # ``_spin``: that of the last request
         self._talk_spin = SpinChooser(may_spin)  # messages take longer than steps
         self._checked: list[Any] | None = None  # fields of a step that needs no check
-        self._listens = False
+        self._listens = False  # whether the runners ring although nobody waits: ``sources``
         # One core is the client's. Shards without a core of their own (the sleepers) sleep until a
         # request comes, then run on the client's core while it sleeps. So the client sleeps for
         # the sleepers first, and then waits awake for the others (the wakers).

@@ -55,6 +55,8 @@ class ServedLane(ColumnSteps):
         batch = ReceivedBatch(relay.declared.manifest.single_observation_space, shards)
         super().__init__(shards[0].layout, batch, relay)
         self._spin = SpinChooser(True)
+        # Whether the present steps are messages; whether the next ones shall be, since a caller has
+        # several in flight; whether the last step went through the slabs.
         self._by_message = self._more_wanted = self._by_slabs = False
 
     @classmethod
@@ -187,9 +189,11 @@ class ServedShard(ShardSlabs):
         request, reply = bytearray(layout.request_bytes), bytearray(slabs.REPLY_BYTES)
         super().__init__(layout, request, memoryview(reply))
         self.observed = observed
-        self._received: Sequence[Buffer] = ()
+        self._received: Sequence[Buffer] = ()  # the observation slab, as the server sent it
         leaves = len(layout.actions)
         self.sizes = leaves, layout.request_bytes, observed.total_bytes
+        # A step is these two in a row: the words of the header that are the client's, and the
+        # actions.
         self._words = memoryview(request)[slabs.OWN_BYTES : (slabs.DTYPES + leaves) * 8]
         self._written = memoryview(request)[slabs.HEADER_BYTES : layout.message]
 

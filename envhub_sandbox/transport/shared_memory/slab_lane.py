@@ -42,7 +42,7 @@ class SlabLane(Lane):
 
     def __init__(self, relay: Lane) -> None:
         super().__init__(relay.jail, relay.runners, relay.number, relay.declared)
-        self._asked = STEP
+        self._asked = STEP  # the operation of the request that is to be answered
         self._fetching: tuple[int, Sequence[int]] = 0, ()  # request's time, shards
         self._settled_ns = 0  # time of the request whose answers ``answered`` has all found
 
@@ -134,9 +134,9 @@ class ColumnSteps(SlabLane):
         self._bounds = self.declared.slices
         self._batch = batch
         self._action_space = self.declared.manifest.single_action_space
-        self._flat_actions = len(layout.actions) == 1 and not layout.actions[0].path
-        self._said: list[Outcome] = []
-        self._joined = JoinedColumns((), ())
+        self._flat_actions = len(layout.actions) == 1 and not layout.actions[0].path  # one array
+        self._said: list[Outcome] = []  # of the last step; empty if all shards had results only
+        self._joined = JoinedColumns((), ())  # of the last schemas
 
     @abstractmethod
     def _outcomes(self, deadline: Deadline) -> tuple[list[Outcome], dict[int, WorkerDiedError]]:
