@@ -347,7 +347,7 @@ def open_jail(
         opened = expect_reply(reply, m.JailOpened)
         runners = _runners(opened, request.runners)
         report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
-        # Named in keep-alives from now on, or a server on another host would end it.
+        # Keeps it alive from now on: a server on another host ends a jail that no client holds.
         client.hold(opened.jail)
         return JailHandle(client, opened.jail, runners, report, limits)
     except EnvHubError:

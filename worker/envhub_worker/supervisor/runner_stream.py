@@ -32,7 +32,7 @@ class RunnerLink:
     pending: collections.OrderedDict[int, Any] = field(default_factory=collections.OrderedDict)
     watched: bool = False
     slabs: ServedSlabs | None = None
-    sent: int = 0  # bytes, of which the kept counts are in ``JailRecord.moved``
+    sent: int = 0  # bytes; after the end ``JailRecord.moved`` has them
     received: int = 0  # likewise
     # Requests that the socket has not taken yet; the first may be sent in part.
     _unsent: collections.deque[memoryview] = field(default_factory=collections.deque)
