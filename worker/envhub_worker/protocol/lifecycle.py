@@ -24,18 +24,18 @@ class State(Enum):
 class Event(Enum):
     """An event in the life of an environment; the value describes it."""
 
-    START = "its jail is up"
-    SUBMIT = "a request was sent"
-    REPLY = "the reply came"
-    TIMEOUT = "the deadline came first"
-    INTERRUPT = "the wait was interrupted"
-    LOSS = "processes that died are to be restarted"
-    REVIVAL = "they are restarted"
-    EXPIRY = "its jail was ended because it was idle"
-    DEATH = "its jail ended"
-    FORGET = "its jail was given up"
-    FORK = "this process is a fork of the one that made it"
-    CLOSE = "it was closed"
+    START = "the environment was built in a jail"
+    SUBMIT = "a request is about to be sent"
+    REPLY = "the reply has arrived"
+    TIMEOUT = "the deadline passed before the reply arrived"
+    INTERRUPT = "an interrupt ended the wait for the reply"
+    LOSS = "some processes died and will be restarted"
+    REVIVAL = "new processes have replaced the dead ones"
+    EXPIRY = "the server ended the jail because it was idle"
+    DEATH = "the jail died or was ended for breaking the protocol"
+    FORGET = "the jail was given up"
+    FORK = "this process is a fork of the environment's process"
+    CLOSE = "the environment was closed"
 
     __hash__ = object.__hash__
 
@@ -44,6 +44,7 @@ TABLE: dict[tuple[State, Event], State] = {
     (State.IDLE, Event.START): State.READY,
     (State.IDLE, Event.CLOSE): State.CLOSED,
     (State.READY, Event.SUBMIT): State.PENDING,
+    # Found out without a request, by a look at the jail before a reset.
     (State.READY, Event.DEATH): State.DEAD,
     (State.READY, Event.FORGET): State.IDLE,
     (State.READY, Event.CLOSE): State.CLOSED,
@@ -63,10 +64,12 @@ TABLE: dict[tuple[State, Event], State] = {
     (State.REVIVING, Event.INTERRUPT): State.LATE,
     (State.REVIVING, Event.DEATH): State.DEAD,
     (State.REVIVING, Event.CLOSE): State.CLOSED,
+    # Only a reset may follow LATE: it takes the late reply, or gives the jail up.
     (State.LATE, Event.REPLY): State.READY,
     (State.LATE, Event.DEATH): State.DEAD,
     (State.LATE, Event.FORGET): State.IDLE,
     (State.LATE, Event.CLOSE): State.CLOSED,
+    # At the cost of one restart, if the policy permits any.
     (State.DEAD, Event.FORGET): State.IDLE,
     (State.DEAD, Event.CLOSE): State.CLOSED,
     (State.FOREIGN, Event.CLOSE): State.CLOSED,
