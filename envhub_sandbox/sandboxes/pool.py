@@ -84,9 +84,9 @@ class _Entry(Generic[S_co]):
     def __init__(self, key: Hashable, server: S_co) -> None:
         self.pid = os.getpid()
         self.key = key
-        self.group: Hashable = None
+        self.group: Hashable = None  # the users that share it now
         self.server = server
-        self.until: float | None = None
+        self.until: float | None = None  # when to end it, while it is idle
         self._uses: list[weakref.ref[ServerUse[Any]]] = []
 
     def uses(self) -> list[ServerUse[Any]]:
@@ -147,10 +147,10 @@ class ServerPool(Generic[S]):
         # a caller who wants a server that is starting waits for its lock: interruption.md, rule 12
         self._starts: weakref.WeakValueDictionary[_Place, threading.RLock]
         self._starts = weakref.WeakValueDictionary()
-        self._used: dict[_Place, _Entry[S]] = {}
-        self._idle: list[_Entry[S]] = []
+        self._used: dict[_Place, _Entry[S]] = {}  # servers with a use, or whose last one just ended
+        self._idle: list[_Entry[S]] = []  # servers without a use, which ``_thread`` ends in time
         self._thread: threading.Thread | None = None
-        self._ends = False
+        self._ends = False  # at the exit: nothing is kept any more
         _pools.add(self)
 
     def acquire(
@@ -192,6 +192,9 @@ class ServerPool(Generic[S]):
     def give_back(self, use: ServerUse[S], entry: _Entry[S], idle_s: float | None) -> bool:
         """End a use, or complete an interrupted end; returns True. Only ``ServerUse`` calls it."""
         with self._changed:
+            # In this order. The last of two threads that give uses back at once sees no live one,
+            # and gives up the server. The entry leaves the table before its server ends: who asks
+            # now gets a new one.
             use.live = False
             if entry.uses():
                 return True  # the last of these uses gives the server up
@@ -321,9 +324,9 @@ class ServerHold:
         # interruption.md, rule 12
         self._lock = threading.RLock()
         self._owner = OwnerProcess()
-        self._open: set[object] = set()
-        self._use: ServerUse[Any] | None = None
-        self._left: list[ServerUse[Any]] = []
+        self._open: set[object] = set()  # a ticket for each environment
+        self._use: ServerUse[Any] | None = None  # keeps the server
+        self._left: list[ServerUse[Any]] = []  # uses to be released, outside of the lock
         # A list without the lock: other threads may append while one waits, and each takes its
         # waits out of the list.
         self._pending_closes: list[Callable[[], None]] = []

@@ -79,9 +79,9 @@ class SharedJail(JailSource):
         launcher.plays = False  # the manifest already says whether sub-environments are independent
         self._lock = threading.RLock()  # interruption.md, rule 12
         self._owner = OwnerProcess()
-        self._first: LoadedJail | None = None
-        self._dead: list[LoadedJail] = []
-        self._users: weakref.WeakSet[LoadedJail] = weakref.WeakSet()
+        self._first: LoadedJail | None = None  # whom the next environment connects to
+        self._dead: list[LoadedJail] = []  # left jails with users, who may still ask how they ended
+        self._users: weakref.WeakSet[LoadedJail] = weakref.WeakSet()  # connections in use
 
     def provide(self, loaded: LoadedJail) -> None:
         """Use a jail that is loaded already as the shared jail."""

@@ -39,10 +39,10 @@ class Counters:
         self.deaths = 0
         self.steps = 0
         self.restarts = 0
-        self._total_ns = 0
-        self._latencies = array("q", bytes(8 * KEPT))
-        self._connection: Lane | None = None
-        self._before = (0, 0, 0)
+        self._total_ns = 0  # of all steps
+        self._latencies = array("q", bytes(8 * KEPT))  # of the last steps, in a ring
+        self._connection: Lane | None = None  # the lane whose traffic is counted now
+        self._before = (0, 0, 0)  # stale replies, and bytes both ways, over earlier lanes
 
     def stepped(self, elapsed_ns: int) -> None:
         """Count an answered step and its latency."""
@@ -175,8 +175,8 @@ class Ledger:
     def forget(self) -> None:
         """Drop all counters; called in a fork, since its environments belong to the parent."""
         self._lock = threading.RLock()  # interruption.md, rule 12
-        self._living: dict[int, tuple[Labels, Counters, HasState]] = {}
-        self._gone: dict[Labels, dict[str, float]] = {}
+        self._living: dict[int, tuple[Labels, Counters, HasState]] = {}  # by the environment's id()
+        self._gone: dict[Labels, dict[str, float]] = {}  # sums over deleted environments
 
     def add(self, env: object, labels: Labels, counters: Counters, lifecycle: HasState) -> None:
         """Add an environment. Its counts stay after it is deleted."""

@@ -93,7 +93,7 @@ class EnvSession:
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
         if whole is None:
             LEDGER.add(self, labels, counters, self.lifecycle)
-        _living.add(self)
+        _living.add(self)  # for a fork, which must touch nothing of it
 
     jails = 1
     """The number of jails that it uses at a time."""

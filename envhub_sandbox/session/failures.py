@@ -74,9 +74,9 @@ class Restarts:
     def __init__(self, policy: Policy, counters: Counters) -> None:
         self._policy = policy
         self._counters = counters
-        self._last = -_CALM_S
-        self._in_a_row = 0
-        self._given_up = False
+        self._last = -_CALM_S  # when the last restart was; long ago
+        self._in_a_row = 0  # restarts in short succession
+        self._given_up = False  # the environment was closed
 
     @property
     def permitted(self) -> bool:
@@ -190,6 +190,7 @@ class Failures:
         WORKER.info("%s: %s", self._label, str(error).partition("\n")[0])
         died = isinstance(error, WorkerDiedError)
         try:
+            # Before the jail is ended: its server forgets the denials with it.
             lease.note_denied(error)
         finally:
             if lease.loaded is not None and (lease.loaded.jail.kept or not died):

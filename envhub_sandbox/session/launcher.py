@@ -144,10 +144,10 @@ class Launcher:
         self._sandbox = confined
         self.runs_on = confined.runs_on(runtime)
         self.retry_s = confined.retry_s
-        self._store = store
-        self._worker = len(repository.places)
+        self._store = store  # the server may read it
+        self._worker = len(repository.places)  # our index in there
         repository.places.append(confined.address)
-        ours = object()
+        ours = object()  # this launcher among the holders
         self.plays = True
         hold, let_go = partial(repository.hold, ours), partial(repository.let_go, ours)
         self.server_hold = ServerHold(self._acquire, hold, let_go)

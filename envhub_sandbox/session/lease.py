@@ -92,9 +92,9 @@ class Lease:
         # interruption.md, rule 12: no thread gives a jail back while another ends it
         self._ending = threading.RLock()
         self._owner = OwnerProcess()
-        self._was_loaded = False
-        self._startup: StartupDeadline | None = None
-        self._release_server: Callable[[], None] = _nothing
+        self._was_loaded = False  # from then on a lost server is waited for
+        self._startup: StartupDeadline | None = None  # of a start that runs now, for ``interrupt``
+        self._release_server: Callable[[], None] = _nothing  # keeps the server between two jails
         self.depart = jails.launcher.server_hold.enter()
         weakref.finalize(self, self.depart).atexit = False  # interruption.md, rule 13
 
@@ -269,6 +269,7 @@ class Lease:
     def leave(self) -> None:
         """End the jail and give it back, but keep its server for the next jail."""
         self._let_server_go()
+        # In this order: a server without a jail may be ended, and the next jail would need another.
         self._release_server = self._launcher.hold()
         try:
             self.end()

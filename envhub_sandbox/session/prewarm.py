@@ -177,10 +177,10 @@ class SuitePrewarm:
         self._suites = [[tuple(map(weakref.ref, task)) for task in suite] for suite in suites]
         self._lock = threading.Lock()
         self._cancelled = threading.Condition(self._lock)
-        self._wanted: list[_Task] = []
-        self._tried: set[_Task] = set()
+        self._wanted: list[_Task] = []  # to be started next, in their order
+        self._tried: set[_Task] = set()  # used or started once: not started ahead again
         self._ahead: list[_Task] = []  # started here and not used yet
-        self._cancelling = 0
+        self._cancelling = 0  # tasks that threads cancel now
         for task in chain.from_iterable(self._suites):
             hash(task)  # weak references keep a hash that was computed while their object lived
             for worker in _living(task):

@@ -56,7 +56,7 @@ class Recovery:
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
         self._settings: dict[Any, list[list[bytes]]] = {}  # by target: each shard's frames
         self._setting: tuple[Any, list[list[bytes]]] | None = None  # set by the pending request
-        self._asked: Sequence[m.Message] = ()
+        self._asked: Sequence[m.Message] = ()  # of the last request, for new runners to repeat
         self.fresh: tuple[int, ...] = ()
 
     # --- requests --------------------------------------------------------------------------------

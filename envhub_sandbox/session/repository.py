@@ -228,8 +228,8 @@ class Repository:
         self.wire_limits: WireLimits = limits_for(policy.limits.message_bytes)
         self.timeouts = timeouts
         self.runtime = runtime
-        self._in_use: list[SharedLock] = []
-        self._holders: set[object] = set()
+        self._in_use: list[SharedLock] = []  # on snapshots and packages, against their removal
+        self._holders: set[object] = set()  # launchers with a live environment
         self._lock_files()
         self.copy = copy
         self.min_ready = min_ready

@@ -101,9 +101,9 @@ class RequestOrder(ABC):
         self.before_request: Callable[[], None] | None = None
         self.after_request: Callable[[], None] | None = None
         self._repository = repository
-        self._unshown = repository.warnings.unshown
+        self._unshown = repository.warnings.unshown  # the list itself: a look costs least
         self._timeouts = repository.timeouts
-        self._step_deadline = StepDeadline(self._timeouts.step_s)
+        self._step_deadline = StepDeadline(self._timeouts.step_s)  # one for all steps
         self._warned_of_two = False
 
     def warn_of_two(self, thread: int) -> None:

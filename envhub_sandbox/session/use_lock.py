@@ -109,7 +109,7 @@ class FleetUse:
 
     def __init__(self, parts: Sequence[UseLock]) -> None:
         self._parts = parts
-        self._holder: int | None = None
+        self._holder: int | None = None  # the thread that holds the locks
 
     @property
     def lock(self) -> AbstractContextManager[None]:

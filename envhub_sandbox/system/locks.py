@@ -109,6 +109,7 @@ def _take(path: Path, mode: int) -> int | None:
     descriptor = os.open(path, _WRITE, mode)
     try:
         lock(descriptor)
+        # A holder that removed the file meanwhile leaves us the lock of a file without a name.
         if os.path.samestat(os.fstat(descriptor), os.stat(path)):
             return descriptor
     except (BlockingIOError, FileNotFoundError):

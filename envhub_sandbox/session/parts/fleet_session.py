@@ -199,11 +199,11 @@ class FleetRequests(RequestOrder):
         self._recorder = recorder
         self._counters = counters
         self._space = results.manifest.single_action_space
-        self._may_not_fit = slabs.layout_of(self._space, 1) is None
-        self._unsent: dict[int, Exception] = {}
-        self._starting: Calls[None] = Calls([])
+        self._may_not_fit = slabs.layout_of(self._space, 1) is None  # steps are messages
+        self._unsent: dict[int, Exception] = {}  # failures to send, by part, for ``_of_all``
+        self._starting: Calls[None] = Calls([])  # the last start of several parts
         self._sent_ns = 0
-        self._first = 0
+        self._first = 0  # the part for which the last step waited first
 
     @property
     def closed(self) -> bool:

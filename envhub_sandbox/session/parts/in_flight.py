@@ -86,8 +86,9 @@ class InFlight:
         self._space = order.results.manifest.single_observation_space
         self._actions = order.results.manifest.single_action_space
         self._worker_of = [at for at, queue in enumerate(self._queues) for _ in range(queue.count)]
+        # Taken, not received; by worker.
         self._ready: deque[tuple[int, StepResult | Exception]] = deque()
-        self._sends = False
+        self._sends = False  # True from the first message of a ``send`` to its last
 
     # --- sending ---------------------------------------------------------------------------------
 

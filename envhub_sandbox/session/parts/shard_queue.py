@@ -33,8 +33,8 @@ class ShardQueue(WorkerQueue):
     def __init__(self, part: EnvSession, shard: int, others: list[ShardQueue]) -> None:
         super().__init__(part, part.bounds[shard], sliced=True)
         self._shard, self._others = shard, others
-        self._whole: Lane | None = None
-        self._way: Lane | None = None
+        self._whole: Lane | None = None  # the environment's lane, of which ``_way`` is a part
+        self._way: Lane | None = None  # to this worker alone
         others.append(self)
 
     @property

@@ -55,9 +55,9 @@ class WorkerQueue:
         self._timeouts = part.repository.timeouts
         self._sliced = sliced
         self._lost = tuple(range(*rows))  # the rows that get no more results after an error
-        self._owed: deque[str] = deque()
-        self._waiting: deque[Any] = deque()
-        self._deadline = Deadline(None)
+        self._owed: deque[str] = deque()  # operations that were sent, the oldest first
+        self._waiting: deque[Any] = deque()  # actions of steps that were not sent yet
+        self._deadline = Deadline(None)  # of the oldest request
         self.taking = False
 
     @property
