@@ -284,7 +284,7 @@ class EnvFactory:
         if self._num_workers is None and not trials.may_share(env):
             seats = [seat for launcher, rows in seats for seat in _each(launcher, *rows)]
         recorder = recorder_for(self._repository.policy.crash_history)
-        unnoted = ShardTrials(None)
+        unnoted = ShardTrials(None)  # one shard each: there is nothing to try
         parts = [
             EnvSession(source(launcher, 1), env, [rows], unnoted, recorder)
             for launcher, rows in seats

@@ -170,12 +170,12 @@ class SpinChooser:
     def __init__(self, allowed: bool) -> None:
         self.budget_ns = 0
         self._chosen = self._spinning = False
-        self._best = {False: 0, True: 0}
-        self._samples: list[int] = []
-        self._misses = 0
+        self._best = {False: 0, True: 0}  # the median time of a step, asleep and awake
+        self._samples: list[int] = []  # of the running trial
+        self._misses = 0  # waits in a row that used up their budget
         self._missed_at: float = 0
         self._trials = 2 if allowed else 0
-        self._interval = _FIRST_INTERVAL
+        self._interval = _FIRST_INTERVAL  # steps between two trials
         # steps until the next decision: none ever comes where spinning is not allowed
         self._left: float = _TRIAL if allowed else float("inf")
 
@@ -246,8 +246,8 @@ class Cores:
     def __init__(self, shards: int) -> None:
         self._cpus = own_cpus()
         self.awake = min(shards, len(self._cpus) - 1)
-        self._until_look = 0
-        self._client = -1
+        self._until_look = 0  # steps until the next look at where the client runs
+        self._client = -1  # the client's core at the last look
         self._chosen = [0] * shards
         self._getcpu = getattr(ctypes.CDLL(None), "sched_getcpu", None)
 

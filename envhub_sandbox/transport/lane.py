@@ -68,9 +68,9 @@ class Lane:
         self.elapsed_ns = 0
         self.declared = declared
         self._asked_ns = 0
-        self._answers: list[m.Message] = []
+        self._answers: list[m.Message] = []  # of the step that ``wait`` has waited for
         self._owed: deque[tuple[int, int, Unpack | None]] = deque()  # id, send time, decoder
-        self._sending = False
+        self._sending = False  # whether it is unknown if a message left
 
     @property
     def takes_more(self) -> bool:

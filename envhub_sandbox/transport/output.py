@@ -126,7 +126,7 @@ class OutputFollower:
     ) -> None:
         self._connect, self._jail, self._sinks = connect, jail, sinks
         self._lines = Lines(sinks.sinks)
-        self._offset = 0
+        self._offset = 0  # of the next byte to ask for, in all that the jail has printed
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="envhub-output", daemon=True)
         self._thread.start()

@@ -51,7 +51,7 @@ class RemoteWarnings:
     def __init__(self) -> None:
         self.unshown: deque[RemoteWarning] = deque()
         self.note_shared: Callable[[], None] | None = None
-        self._known: set[RemoteWarning] = set()
+        self._known: set[RemoteWarning] = set()  # each is shown once
 
     def take(self, frames: Sequence[Buffer]) -> Sequence[Buffer]:
         """Collect the warnings in front of a reply; returns the reply's other frames.

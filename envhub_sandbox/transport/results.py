@@ -47,8 +47,9 @@ class Results:
         self.max_bytes = DEFAULT_LIMITS.message_bytes
         self._space = manifest.single_observation_space
         self._declared = manifest.shardable
-        self._sizes = [stop - start for start, stop in bounds]
+        self._sizes = [stop - start for start, stop in bounds]  # rows of each shard
         first = self.bounds[0][0]
+        # Rows of our own batch.
         self.slices = [(start - first, stop - first) for start, stop in bounds]
         self.count = sum(self._sizes)
         self._restores = batches.restores(self._space)

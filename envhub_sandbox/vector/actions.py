@@ -135,7 +135,7 @@ class ActionReader:
         self._space = space
         self._count = count
         self._shape: tuple[int, ...] | None = None
-        self._dtypes: frozenset[Any] = frozenset()
+        self._dtypes: frozenset[Any] = frozenset()  # dtypes that need no further look
         if isinstance(space, ARRAY_SPACES):
             self._shape = _shape(space, count)
             kinds = _kinds_for(space)

@@ -72,8 +72,8 @@ class Generators:
         self.single = False
         self._requests = requests
         self._live: list[_Live] = []
-        self._current = False
-        self._asking = False
+        self._current = False  # whether no request was sent since the last read
+        self._asking = False  # whether our own requests run, which change nothing
 
     def read(self) -> list[np.random.Generator]:
         """Update the caller's generators and return them."""

@@ -66,7 +66,8 @@ class SingleEnv(gym.Env[Any, Any]):
         self._vector = vector
         self._close = close or vector.close
         self._apart = vector._apart() if isinstance(vector, SandboxVectorEnv) else None
-        self._begun: tuple[Any, dict[str, Any]] | None = None
+        # The next episode, which has begun already.
+        self._begun: tuple[Any, dict[str, Any]] | None = None  # what the next reset returns
         # the declared spaces, since the caller may set others
         self._observations = vector.single_observation_space, vector.observation_space
         self.__dict__.update(  # not by __setattr__, which would set them in the environment as well

@@ -257,10 +257,10 @@ class TaskMap(Generic[T]):
         self._play = play
         self._total = len(tasks)
         self._left = deque(tasks)
-        self._ahead = 1 < live < len(tasks)
+        self._ahead = 1 < live < len(tasks)  # whether one of the live tasks is only started
         self._threads = min(len(tasks), live - self._ahead)
         self._lock = threading.RLock()  # interruption.md, rule 12
-        self._failure: BaseException | None = None
+        self._failure: BaseException | None = None  # the first; no further task begins
         self._results: dict[tuple[str, Any], T] = {}
 
     def run(self) -> dict[str, dict[Any, T]]:

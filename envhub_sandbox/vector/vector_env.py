@@ -77,14 +77,14 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     def __init__(self, session: AnySession, again: Callable[[], AnySession] | None = None) -> None:
         super().__init__(session)
-        self._again = again
-        self._owner = OwnerProcess()
+        self._again = again  # makes another session after ``close``, for LeRobot
+        self._owner = OwnerProcess()  # a fork must not close it
         manifest = self._manifest
         self._requests.face = type(self).__name__
         self._timeouts = session.repository.timeouts
         self._read_actions = action_reader(manifest, manifest.num_envs)
         self._generators = Generators(self._requests)
-        self._still: Any = None
+        self._still: Any = None  # the last picture of the first sub-environment, for notebooks
         self.single_observation_space = manifest.single_observation_space
         self.single_action_space = manifest.single_action_space
         self.observation_space = manifest.observation_space

@@ -39,7 +39,7 @@ class Loop:
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         self._failed = failed
         self._poller = zmq.Poller()
-        self._callbacks: dict[Any, Callable[[], None]] = {}
+        self._callbacks: dict[Any, Callable[[], None]] = {}  # by descriptor or socket
         self._stopped = False
         self._tick: Callable[[], None] = _nothing
         self._look: Callable[[], int | None] = _nothing

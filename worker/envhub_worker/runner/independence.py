@@ -311,10 +311,10 @@ class Turns:
 
     def __init__(self) -> None:
         self.most_s = inf
-        self._index = _OURS
-        self._slept_s = 0.0
-        self._ticks: Counter[int] = Counter()
-        self._draws: Counter[int] = Counter()
+        self._index = _OURS  # the sub-environment whose turn it is
+        self._slept_s = 0.0  # in this turn, on the main thread
+        self._ticks: Counter[int] = Counter()  # each one's clock, in nanoseconds
+        self._draws: Counter[int] = Counter()  # how often each one has drawn entropy
 
     def run(self, index: int, call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """Call a sub-environment's method in its turn. Raises ``HeavyError``: it takes too long."""

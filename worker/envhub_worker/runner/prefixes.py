@@ -52,7 +52,7 @@ class WarningLog:
 
     def __init__(self) -> None:
         self.pending: list[RemoteWarning] = []
-        self._heard: set[RemoteWarning] = set()
+        self._heard: set[RemoteWarning] = set()  # each goes out once
 
     def listen(self) -> None:
         """Collect every warning that any thread shows from now on."""

@@ -51,8 +51,8 @@ class FreezingEnv:
 
     def __init__(self, env: Any) -> None:
         self._env = env
-        self._last: Any = None
-        self._frame: Any = None
+        self._last: Any = None  # the transition that ended the episode; None before it
+        self._frame: Any = None  # the picture after it
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         """Like ``Env.reset``; once frozen, returns the last observation and info instead."""
@@ -98,14 +98,14 @@ class Batch:
     def __init__(self, space: gym.Space[Any], count: int, reward_shape: tuple[int, ...]) -> None:
         self._space = space
         self._count = count
-        self._members: list[Any] = [None] * count
+        self._members: list[Any] = [None] * count  # observations of a space without a fixed layout
         self.rewards = np.zeros((count, *reward_shape))
         self.terminations = np.zeros(count, np.bool_)
         self.truncations = np.zeros(count, np.bool_)
         self.rows: list[Any] = [None] * count
-        self._slots: list[tuple[list[Any], Store, list[Any]]] = []
-        self._slot = 0
-        self._left: int | None = None
+        self._slots: list[tuple[list[Any], Store, list[Any]]] = []  # leaves, their writer, and rows
+        self._slot = 0  # which of them is written now
+        self._left: int | None = None  # a slot whose rows the next one begins with
         layout = slabs.observation_layout(space, count, 1)
         if layout is None:
             self.store: Store = self._keep
@@ -195,8 +195,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self.reward_shape = () if sync else _reward_shape(self.envs[0])
         self.batch = Batch(self.single_observation_space, self.num_envs, self.reward_shape)
         self.driven: Sequence[Any] = self.envs
-        self._done = [False] * self.num_envs
-        self._done_before = self._done
+        self._done = [False] * self.num_envs  # whose episodes are over: the next step resets them
+        self._done_before = self._done  # before the last step, in case its infos cannot be joined
         self._flagged: list[int] = []  # whose flags are not both False
         self._mode = autoreset_mode
         self._sync = sync

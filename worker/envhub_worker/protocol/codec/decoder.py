@@ -86,9 +86,9 @@ class Decoder:
         self._borrows = borrows
         self._tail, self._buffers, self.limits = tail, buffers, limits
         self.unpickler, self.tensors, self.things = unpickler, tensors, things
-        self._arrays: ArrayReader | None = None
+        self._arrays: ArrayReader | None = None  # made for the first array of the message
         self._make: Callable[[int, object], object] | None = None
-        self._heads = self._hashed_keys = 0
+        self._heads = self._hashed_keys = 0  # heads without their array yet; keys so far
         self.notes: list[tuple[Array, bytes]] | None = None
 
     def value(self, document: bytes) -> object:

@@ -53,14 +53,15 @@ class SharedState:
 
     def __init__(self, root: str, report: Callable[[str], None]) -> None:
         self._root = os.path.join(root, "")
-        self._report: Callable[[str], None] | None = report
+        self._report: Callable[[str], None] | None = report  # None once it was called
         self._generators = _numpy_generator(), random._inst
         self._numpy, self._random = _numpy_words(self._generators[0]), _random_words()
         self._numpy_before, self._random_before = self._numpy.tolist(), self._random.tolist()
         self._torch = _torch_states()
+        # What takes longer to read, at the last close look.
         self._slow: dict[tuple[str, ...], object] = {}
         self.packages: set[str] = set()
-        self._left = self._every = _FIRST
+        self._left = self._every = _FIRST  # looks until the next close one, which gets rarer
 
     def built(self, envs: list[Any]) -> None:
         """Compare the packages that define the environments, too, once all of them are built."""
