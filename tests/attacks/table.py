@@ -70,7 +70,7 @@ class Collected:
     def read(self, report: pytest.TestReport) -> None:
         if report.when == "teardown":
             found = [row for name, row in report.user_properties if name == self._name]
-            self._rows += [Row(**row) for row in found]  # type: ignore[arg-type]
+            self._rows += [Row(**row) for row in found]
 
     def write(self, session: pytest.Session) -> None:
         path = os.environ.get(self._variable)

@@ -198,7 +198,7 @@ def test_an_error_does_not_overtake_the_result_before_it(tmp_path: Path, lane: s
         assert (received.env_ids.tolist(), received.observations.tolist()) == ([0, 1], [0, 2])
         with pytest.raises(ValueError, match="one") as info:
             env.recv()
-        assert info.value.env_ids == (0,)  # type: ignore[attr-defined]
+        assert info.value.env_ids == (0,)
         env.step(np.array([0, 0]))
 
 

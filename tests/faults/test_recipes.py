@@ -19,7 +19,7 @@ def tenth_step(env: Any) -> list[list[float]]:
         env.step([0, 0])
     observations = env.step([0, 0])[0].tolist()
     env.close()
-    return observations  # type: ignore[no-any-return]
+    return observations
 
 
 @pytest.mark.usefixtures("neighbour")

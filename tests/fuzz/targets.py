@@ -121,7 +121,7 @@ def unpack(dice: Dice) -> None:
     if is_error(first):
         raise first
     plain = decode(frames, things=DescriptionReader)
-    demand(alike(parts(first), plain[1:]), "not what the codec says")  # type: ignore[index]
+    demand(alike(parts(first), plain[1:]), "not what the codec says")
     usable(parts(first))
     whole = [*map(bytes, encode([first.kind, *parts(first)]))]
     for _ in range(3):
@@ -380,7 +380,7 @@ def warnings(dice: Dice) -> None:
     for _ in range(rng.randrange(1, 9)):
         some = [(f"UserWarning {rng.random()}", "x" * rng.randrange(3000)) for _ in range(3)]
         told = m.Warnings(tuple(dice.inside(list(some))))
-        front = attempt(lambda told=told: m.pack(told))  # type: ignore[misc]
+        front = attempt(lambda told=told: m.pack(told))
         if is_error(front):
             raise NotSentError
         frames = [*front, *reply]
@@ -410,7 +410,7 @@ def server(dice: Dice) -> None:
     if isinstance(message, m.Death):
         usable(str(death(message)))
     wanted = rng.choice((m.Done, m.RelayDone, m.JailOpened, m.Output, m.Welcome))
-    usable(str(attempt(lambda: expect_reply(message, wanted))))  # type: ignore[type-abstract]
+    usable(str(attempt(lambda: expect_reply(message, wanted))))
     check_reply(message)
 
 

@@ -258,7 +258,7 @@ def freezes() -> None:
         for _ in range(9):
             same.append(alike(*pairs))
             actions = theirs.action_space.sample()
-            pairs = [env.step(actions) for env in (theirs, ours)]  # type: ignore[misc]
+            pairs = [env.step(actions) for env in (theirs, ours)]
             same.append(alike(theirs.call("render"), ours.call("render")))
     steps = [env.get_attr("steps") for env in (theirs, ours)]
     resets = [env.get_attr("resets") for env in (theirs, ours)]
@@ -295,7 +295,7 @@ def commands() -> None:
 def taken(program: str, *words: str) -> list[str | None]:
     """What is played, and by what kind of policy, as that program of LeRobot's understands it."""
     if program == "lerobot-eval-sandboxed":
-        options, words = lerobot_eval.split_eval_arguments([*words])  # type: ignore[assignment]
+        options, words = lerobot_eval.split_eval_arguments([*words])
         ours.install(**options)
     made: list[Any] = []
     kind = TrainPipelineConfig if program == "lerobot-train" else EvalPipelineConfig

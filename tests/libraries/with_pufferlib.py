@@ -28,7 +28,7 @@ def played(sandboxed: bool) -> list[Any]:
     seen = [np.array(envs.reset(seed=1)[0])]
     for _ in range(STEPS):
         result = envs.step(drawn.integers(0, 2, COUNT))[:4]
-        seen.append(tuple(np.array(one) for one in result))  # type: ignore[arg-type]
+        seen.append(tuple(np.array(one) for one in result))
     envs.close()
     return seen
 

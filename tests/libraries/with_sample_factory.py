@@ -30,7 +30,7 @@ def played(sandboxed: bool) -> list[Any]:
     for _ in range(STEPS):
         observations, *rest = env.step(np.array([drawn.integers(0, 2)]))[:4]
         found = {key: one.numpy().copy() for key, one in observations.items()}
-        seen.append((found, *(one.numpy().copy() for one in rest)))  # type: ignore[arg-type]
+        seen.append((found, *(one.numpy().copy() for one in rest)))
     env.close()
     return seen
 

@@ -50,7 +50,7 @@ def packed_by_hand(sizes: tuple[int, ...], *bodies: bytes, name: str = "lz4") ->
         (packed_by_hand((100,), b"no lz4 at all"), RemoteProtocolError),
         (packed_by_hand((-2,), b"x"), RemoteProtocolError),
         (packed_by_hand((1, 2), b"x"), RemoteProtocolError),
-        (packed_by_hand(("a",), b"x"), RemoteProtocolError),  # type: ignore[arg-type]
+        (packed_by_hand(("a",), b"x"), RemoteProtocolError),
         (packed_by_hand((1,), b"x", name="zip"), RemoteProtocolError),
     ],
 )

@@ -105,7 +105,7 @@ def test_what_is_honest_is_taken(liar: LyingServer, folder: str) -> None:
     one = Lie(SPACE, {"kind": "multi_binary", "n": 9_000_000})
     liar.lies[m.Call] = relayed(frames_of(one))
     with started(liar, folder) as env:
-        assert env.get_attr("thing")[0].n == one.value["n"]  # type: ignore[index]
+        assert env.get_attr("thing")[0].n == one.value["n"]
 
 
 def test_the_control_takes_the_memory() -> None:

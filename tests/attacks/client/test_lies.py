@@ -156,7 +156,7 @@ def test_wrong_arrays_are_refused(liar: LyingServer, folder: str, what: str) -> 
 
 
 def described(value: object) -> Frames:
-    return m.pack(m.LoadDone(value))  # type: ignore[arg-type]
+    return m.pack(m.LoadDone(value))
 
 
 def changed(**fields: Any) -> dict[str, Any]:
@@ -174,7 +174,7 @@ def text(longest: int) -> dict[str, Any]:
 
 
 def box(**fields: Any) -> dict[str, Any]:
-    return {**encode_space(spaces.Box(-1, 1, (3,), np.float32)), **fields}  # type: ignore[dict-item]
+    return {**encode_space(spaces.Box(-1, 1, (3,), np.float32)), **fields}
 
 
 WIDE, ELEMENTS = 4_000_000, 10_000_000
@@ -417,7 +417,7 @@ def test_wrong_sums_of_parts_refused(
         m.Refusal("VersionMismatchError", "\x1b[2J", "", ""),
         m.Refusal("os.system", "\x1b[2J", "", ""),
         m.JailOpened(1, (), ()),
-        m.JailOpened(1, ("1",), ()),  # type: ignore[arg-type]
+        m.JailOpened(1, ("1",), ()),
         m.Death(-1, "exit", None, "\x1b[2J", "\x1b[2J", "\x1b[2J", "\x1b[2J"),
         m.Value(None),
     ],

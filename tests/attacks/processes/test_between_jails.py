@@ -42,7 +42,7 @@ def test_another_jail_cannot_be_written_to(jail: OpenJail, pair: Pair) -> None:
 
 
 def test_scratch_of_another_jail_cannot_be_read(jail: OpenJail, pair: Pair) -> None:
-    path = pair.inside.path  # type: ignore[union-attr]
+    path = pair.inside.path
     through_root = f"/proc/{pair.inside.pid}/root{path}"
     own = f"/proc/{pair.outside.pid}/fd/{pair.outside.fd}"
     for way, inside in {"path": path, "/proc/<pid>/root": through_root}.items():

@@ -167,8 +167,8 @@ def _check_what_is_seen(row: Row, error: Exception | None) -> None:
         assert part in text
     if row.error == "WorkerDiedError":
         assert f"about to {row.fault}" in text
-        assert f"about to {row.fault}" in error.log_tail  # type: ignore[attr-defined]
-        bundle = Path(error.bundle)  # type: ignore[attr-defined]
+        assert f"about to {row.fault}" in error.log_tail
+        bundle = Path(error.bundle)
         assert f"about to {row.fault}" in (bundle / "README.txt").read_text()
 
 

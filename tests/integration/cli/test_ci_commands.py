@@ -175,7 +175,7 @@ def test_a_server_on_another_host_is_obeyed_no_more(capsys: pytest.CaptureFixtur
             "detailed": True,
             "quotas": {_LONG: 3},
             "used": {},
-        }  # type: ignore[arg-type]
+        }
     )
     server: Any = type("Server", (), {"endpoint": _LONG, "insecure_loopback": False})()
     with guarded():

@@ -36,7 +36,7 @@ def started() -> set[int]:
 
 def used(server_idle_s: float | None, **options: object) -> None:
     timeouts = {"server_idle_s": server_idle_s}
-    with make_env(sample("counter"), n_envs=2, timeouts=timeouts, **options) as suites:  # type: ignore[arg-type]
+    with make_env(sample("counter"), n_envs=2, timeouts=timeouts, **options) as suites:
         suites.env.reset(seed=0)
 
 

@@ -153,7 +153,7 @@ def test_classes_that_the_jail_has_are_used(
     exec(_PARTS, vars(parts))
 
     @dataclass(kw_only=True)
-    class OfTheCaller(parts.Base):  # type: ignore[name-defined, misc]
+    class OfTheCaller(parts.Base):
         hub_path: str
         episodes: int = 3
         arm: Any = field(default_factory=lambda: parts.Arm(7))
@@ -161,7 +161,7 @@ def test_classes_that_the_jail_has_are_used(
         where: Path = Path("somewhere")
         type: str = "arms"
 
-    cfg = OfTheCaller(fps=20, hub_path=str(folder))  # type: ignore[call-arg]
+    cfg = OfTheCaller(fps=20, hub_path=str(folder))
     found = seen(cfg)
     assert (found["name"], found["base"], found["same arm"]) == ("OfTheCaller", 40, True)
 

@@ -171,7 +171,7 @@ def test_a_generator_that_is_kept_stays_the_environments(folder: Path, single: S
     """As long as the environment has the same one: a seed gives it another."""
     assert_same(_kept(_here(folder).envs[0]), _kept(single))
     with pytest.raises(TypeError, match="PCG64"):
-        single.np_random = 3  # type: ignore[assignment]
+        single.np_random = 3
 
 
 def _vectors(env: Any) -> list[Any]:

@@ -117,7 +117,7 @@ def _gate(folder: Path) -> RemoteGate:
         idle_s=0,
     )
     gate = RemoteGate(rules, Uploads(folder, Quotas()), Packages(None, Quotas()), Log())
-    gate.begin(Sessions(), None)  # type: ignore[arg-type]
+    gate.begin(Sessions(), None)
     return gate
 
 

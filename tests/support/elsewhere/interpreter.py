@@ -156,12 +156,12 @@ def _refuse_imports(gone: set[str]) -> None:
             raise ModuleNotFoundError(f"No module named {name!r} there", name=name)
         return before(name, *rest, **named)
 
-    builtins.__import__ = imported  # type: ignore[assignment]
+    builtins.__import__ = imported
 
 
 def _is_kernels(path: object) -> bool:
     try:
-        text = os.fsdecode(path)  # type: ignore[arg-type]
+        text = os.fsdecode(path)
     except TypeError:
         return False
     return text.startswith(("/proc/", "/sys/")) or text in ("/proc", "/sys")
@@ -242,7 +242,7 @@ def _windows_files() -> None:
                 given["newline"] = "\r\n"
         return text_open(file, mode, buffering, **given)
 
-    io.open = builtins.open = open_text  # type: ignore[assignment]
+    io.open = builtins.open = open_text
 
 
 def _with_windows_modes(call: Any) -> Any:
@@ -262,9 +262,9 @@ def _with_windows_modes(call: Any) -> Any:
 
 
 def _windows_processes() -> None:
-    subprocess.CREATE_NEW_PROCESS_GROUP = 0x200  # type: ignore[attr-defined]
-    subprocess.STARTUPINFO = lambda: types.SimpleNamespace(dwFlags=0)  # type: ignore[attr-defined]
-    subprocess.STARTF_USESHOWWINDOW = 1  # type: ignore[attr-defined]
+    subprocess.CREATE_NEW_PROCESS_GROUP = 0x200
+    subprocess.STARTUPINFO = lambda: types.SimpleNamespace(dwFlags=0)
+    subprocess.STARTF_USESHOWWINDOW = 1
     begin, find = subprocess.Popen.__init__, shutil.which
 
     def started(self: Any, *given: Any, **named: Any) -> None:
@@ -289,7 +289,7 @@ def _windows_processes() -> None:
         finally:
             sys.platform = "win32"
 
-    subprocess.Popen.__init__ = started  # type: ignore[method-assign]
+    subprocess.Popen.__init__ = started
     shutil.which = which
 
 
@@ -320,7 +320,7 @@ def _windows_sockets() -> None:
 
     socket.socketpair = pair
     select.select = select_there
-    zmq.Poller.register = register  # type: ignore[method-assign]
+    zmq.Poller.register = register
 
 
 def _windows_locks() -> None:

@@ -62,11 +62,11 @@ class Camera:
     sizes: dict[str, int] = dataclasses.field(default_factory=dict)
 
 
-class OwnDict(dict):  # type: ignore[type-arg]
+class OwnDict(dict):
     """A dict with a class."""
 
 
-class OwnList(list):  # type: ignore[type-arg]
+class OwnList(list):
     """A list with a class."""
 
 

@@ -23,14 +23,14 @@ _NOT_INSTALLED = re.compile(r"could not import '([\w.]+)'")
 def pytest_runtest_makereport() -> Iterator[None]:
     """In CI a skipped test is a failed one."""
     report = yield
-    return _no_skips(report)  # type: ignore[return-value]
+    return _no_skips(report)
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report() -> Iterator[None]:
     """In CI a skipped module is a failed one."""
     report = yield
-    return _no_skips(report)  # type: ignore[return-value]
+    return _no_skips(report)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
