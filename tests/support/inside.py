@@ -13,9 +13,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pytest
 import zmq
 
 from envhub_sandbox.extras.docker import container
+from envhub_sandbox.extras.judge import static
 from envhub_sandbox.extras.judge.play import task, traces
 from envhub_sandbox.extras.packages import environments, interpreters, modules, source
 from envhub_sandbox.extras.packages.resolution import resolutions
@@ -255,6 +257,13 @@ wrong_types = task._untyped
 wrong_masks = traces._masks
 info_bytes = traces._bytes_of
 small_trace = partial(traces.Trace, _left=1 << 20)
+
+
+def keep_few_findings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A survey that keeps 1,000 findings, and reads 2 MiB of texts."""
+    monkeypatch.setattr(static, "_MOST", 1_000)
+    monkeypatch.setattr(static, "_MOST_BYTES_IN_ALL", 2 << 20)
+
 
 # --- the connection to another host ------------------------------------------------------------
 

@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import SnapshotError
@@ -124,7 +124,7 @@ def test_patterns_that_cannot_be_read_are_an_error(
     """One can take git for ever, and what it says then is not known: which files it converts."""
     (repository.folder / ("a" * 200 + "1")).write_text("")
     (repository.folder / name).write_text(f"{'*a' * 60}b{rest}\n")
-    monkeypatch.setattr(checkout, "TIMEOUT_S", 1.0)
+    monkeypatch.setattr(checkout, "TIMEOUT_S", 0.4)
     with pytest.raises(SnapshotError, match=r"cannot read its \.gitattributes"):
         found(repository.folder)
 
@@ -211,7 +211,7 @@ def one_kind(files: dict[str, tuple[str, bytes]]) -> dict[str, tuple[str, bytes]
     return {path: one for path, one in files.items() if not path.startswith(tuple(links))}
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=settings().max_examples // 6)
 @given(_COMMITS)
 def test_a_clone_is_judged_as_its_commit_or_fails(files: dict[str, tuple[str, bytes]]) -> None:
     """Each file that the Hub would hand out is there, as it is; or it is reported, and fails."""

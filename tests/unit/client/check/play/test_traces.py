@@ -81,7 +81,7 @@ def traced(seen: Any, rewards: Sequence[float] = (0.0, 0.0)) -> Trace:
             "the observation['b'][1] is str 'y' and str 'z'"),
         ((np.zeros(2, np.float32),), (np.zeros(2),), 0,
             "the observation is float32 (2,) and float64 (2,)"),
-        ((np.zeros(5 << 20),), (np.ones(5 << 20),), 0, ""),
+        ((np.zeros(33 << 20, np.int8),), (np.ones(33 << 20, np.int8),), 0, ""),
     ],
     ids=["row", "reward", "text", "dtype", "too large to be kept"],
 )  # fmt: skip
@@ -97,7 +97,7 @@ def test_what_differs_has_its_row_and_values(one: Any, other: Any, at: int, word
 @pytest.mark.parametrize("wide", [True, False], ids=["long name", "many parts"])
 def test_what_is_kept_of_results_is_bounded(wide: bool) -> None:
     """By names as by values; a worker chooses how long the one and how many the others are."""
-    parts: Any = {str(number): np.zeros(1) for number in range(1000)}
+    parts: Any = {str(number): np.zeros(1) for number in range(300 if wide else 1000)}
     trace = inside.small_trace()
     tracemalloc.start()
     try:

@@ -85,18 +85,15 @@ def test_fps_is_sensible_whatever_the_metadata_says(metadata: Any, fps: float) -
 def test_a_written_video_can_be_read(
     tmp_path: Path, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "out.mp4"
-    with plays.video_writer(path, 10.0) as add:
-        for value in range(0, 250, 10):
-            add(frame(*size, value))
-    assert imageio_ffmpeg.count_frames_and_secs(str(path))[0] == 25
-    meta = next(imageio_ffmpeg.read_frames(str(path)))
-    assert meta["size"] == size[::-1]
-    assert meta["fps"] == 10.0
     monkeypatch.chdir(tmp_path)  # a file that begins with a dash is a file, and no option
     with plays.video_writer(Path("-version.mp4"), 10.0) as add:
-        add(frame())
-    assert (tmp_path / "-version.mp4").stat().st_size > 0
+        for value in range(0, 250, 10):
+            add(frame(*size, value))
+    path = str(tmp_path / "-version.mp4")
+    assert imageio_ffmpeg.count_frames_and_secs(path)[0] == 25
+    meta = next(imageio_ffmpeg.read_frames(path))
+    assert meta["size"] == size[::-1]
+    assert meta["fps"] == 10.0
 
 
 def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
@@ -182,7 +179,7 @@ def test_a_pixel_is_the_mean_of_those_that_it_stands_for() -> None:
     assert small_picture(frame, 6) is frame, "nothing is enlarged"
 
 
-@pytest.mark.parametrize("size", [(1, 4096), (4096, 1), (2, 321), (4096, 4096), (319, 4095)])
+@pytest.mark.parametrize("size", [(1, 4096), (4096, 1), (2, 321), (960, 961), (319, 4095)])
 def test_no_side_is_longer_and_none_is_nothing(size: tuple[int, int]) -> None:
     small = small_picture(np.zeros((*size, 3), np.uint8), 320)
     assert min(small.shape[:2]) >= 1
