@@ -105,6 +105,8 @@ def parts(space: Any, value: Any, path: str = "") -> Iterator[tuple[str, Any, st
     elif isinstance(space, spaces.Tuple):
         keys = range(len(space.spaces))
     elif isinstance(space, ARRAY_SPACES):
+        if type(value) is np.ndarray and (value.shape, value.dtype) == (space.shape, space.dtype):
+            return
         try:
             np.stack([value], out=np.empty((1, *(space.shape or ())), space.dtype))
         except Exception:

@@ -106,9 +106,11 @@ class Batch:
         self._slots: list[tuple[list[Any], Store, list[Any]]] = []  # leaves, their writer, and rows
         self._slot = 0  # which of them is written now
         self._left: int | None = None  # a slot whose rows the next one begins with
+        self._empty: Any = None  # what batches are made in, where there are no slots
         layout = slabs.observation_layout(space, count, 1)
         if layout is None:
             self.store: Store = self._keep
+            self._empty = create_empty_array(space, n=count, fn=np.zeros)
         else:
             self.write_to([[np.zeros(leaf.shape, leaf.dtype) for leaf in layout.leaves]])
 
@@ -153,8 +155,7 @@ class Batch:
         """Returns the batched observation: views of arrays that the next step overwrites."""
         if self._slots:
             return slabs.assembler(self._space)(self._slots[self._slot][0])
-        empty: Any = create_empty_array(self._space, n=self._count, fn=np.zeros)
-        return concatenate(self._space, self._members, empty)
+        return concatenate(self._space, self._members, self._empty)
 
     def members(self) -> list[Any]:
         """Returns each sub-environment's observation."""

@@ -50,8 +50,10 @@ _PARAMETER = struct.Struct("<I")
 _SHAPES = tuple(struct.Struct(f"<{n}Q") for n in range(MAX_DIMENSIONS + 1))
 
 
-_CODES = {
-    char: _DTYPES.index(np.dtype(char)) for char in "?bBhHiIlLqQefdFD" if np.dtype(char) in _DTYPES
+_NUMBER_HEADS = {
+    char: bytes((_DTYPES.index(np.dtype(char)),))
+    for char in "?bBhHiIlLqQefdFD"
+    if np.dtype(char) in _DTYPES
 }
 """By the character of a dtype: "l" and "q" are the same integer on most platforms."""
 NUMBERS = frozenset(_DTYPES)
@@ -164,9 +166,9 @@ def describe_dtype(dtype: np.dtype[Any]) -> bytes:
     """Returns the code of a dtype, followed by its parameter where it has one.
     Raises ``LocalProtocolError``: the dtype is not on the list.
     """
-    code = _CODES.get(dtype.char)
-    if code is not None:
-        return bytes((code,))
+    number = _NUMBER_HEADS.get(dtype.char)
+    if number is not None:
+        return number
     code = _SIZED.get(dtype.kind)
     if code is None or dtype.names is not None:
         raise LocalProtocolError(f"dtype {dtype} has no form on the wire")
@@ -332,6 +334,9 @@ def _write_array(encoder: Encoder, array: Array) -> object:
 
 def _write_scalar(encoder: Encoder, scalar: np.generic) -> object:
     """Encodes a numpy scalar as dtype code, parameter and value; a structured value is a tuple."""
+    number = _NUMBER_HEADS.get(scalar.dtype.char)
+    if number is not None:
+        return msgpack.ExtType(wire.SCALAR, number + scalar.tobytes())
     if isinstance(scalar, np.void) and encoder.pickler is None:
         plain = scalar.item()
         return plain if type(plain) is bytes else encoder.default(plain)
