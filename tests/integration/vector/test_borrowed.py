@@ -1,6 +1,7 @@
 """``copy=False``: observations that are lent, and still never change under whoever holds them."""
 
 import mmap
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.transport.shared_memory.client_slabs import RING
 from tests.support.compare import assert_same
+from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
 STEPS = 40
@@ -69,3 +71,23 @@ def test_batches_are_lent_where_they_lie() -> None:
         for _ in range(3 * RING):
             env.step([1, 0])
     np.testing.assert_array_equal(rows, values)
+
+
+def test_what_has_no_elements_is_lent_like_the_rest(tmp_path: Path) -> None:
+    empty = """
+class Empty(gym.Wrapper):
+    observation_space = gym.spaces.Box(-1, 1, (0, 2))
+
+    def reset(self, **options):
+        return np.zeros((0, 2)), {}
+
+    def step(self, action):
+        return np.zeros((0, 2)), 0.0, False, False, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return vector(lambda: Empty(Still()), n_envs)
+"""
+    with make_env(write_repository(tmp_path, STILL + empty), n_envs=2, copy=False) as suites:
+        env = suites.env
+        batches = [env.reset()[0], *(env.step([0, 1])[0] for _ in range(RING))]
+    assert {(batch.shape, batch.dtype.name) for batch in batches} == {((2, 0, 2), "float32")}

@@ -148,7 +148,7 @@ def observation_layout(space: gym.Space[Any], count: int, slots: int) -> Observa
         return None
     placed, slot_bytes = _placed(leaves, count, 0, None)
     if slots > 1:
-        slot_bytes = _paged(slot_bytes)
+        slot_bytes = _paged(slot_bytes or 1)  # no map is empty
     results = slot_bytes * slots
     total_bytes = _aligned(results + count * _RESULT_BYTES)
     if total_bytes > MAX_SLAB_BYTES:
