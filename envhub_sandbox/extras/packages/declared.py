@@ -110,6 +110,13 @@ class WantedPackage:
     where: str
     hashes: tuple[str, ...] = ()
 
+    @property
+    def is_open(self) -> bool:
+        """Tells whether more than one release may satisfy it."""
+        pins = (one for one in self.requirement.specifier if one.operator in ("==", "==="))
+        exact = any(not one.version.endswith(".*") for one in pins)
+        return not (exact or self.hashes or self.requirement.url)
+
     def __str__(self) -> str:
         return " ".join([str(self.requirement), *(f"--hash={digest}" for digest in self.hashes)])
 

@@ -100,6 +100,7 @@ def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Te
             lock = partial(_lock_for, interpreter=one, tell=tell, builder=builder, refresh=refresh)
             try:
                 found, taken = versions_for(asked, lock)
+                found = _with_newest(asked, taken, found, one, tell)
                 return Resolution(found, one, tuple(guess.module for guess in taken))
             except DependencyError as error:
                 if error.reason != "resolution":
@@ -110,6 +111,34 @@ def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Te
     cure = _cure(request, failed[0], first)
     what = resolve.advice(request.python, list(dict.fromkeys(tried)), failed[0], cure)
     raise DependencyError(f"{failed[0]}\n{what}", reason="resolution") from failed[0]
+
+
+def _with_newest(
+    request: PackageRequest,
+    taken: Sequence[Guess],
+    lock: Lock,
+    interpreter: Interpreter,
+    tell: Tell,
+) -> Lock:
+    """Returns a lock with the releases that pip would take of the packages that a request names:
+    those without a wheel are built. Where that fails, an older wheel stays, with a warning.
+    """
+    wanted = (*request.wanted, *(guess.wanted for guess in taken))
+    request, target = replace(request, wanted=wanted, guesses=()), Target(python=interpreter.path)
+    kept: list[Source] = []
+    for source in resolve.newer_sources(request, lock, target) if BUILDER is not None else ():
+        try:
+            both = (*kept, source)
+            lock = _lock_for(request, interpreter, tell, builder=BUILDER, sources=both)
+            kept.append(source)
+        except DependencyError as error:
+            if error.reason in ("index", "integrity"):
+                raise
+            [old] = [pin for pin in lock.packages if pin.startswith(f"{source.name}==")]
+            older = option_name("dependencies", {"override": [old]})
+            text = f"{old} is installed, the newest that has a wheel; {older} asks for it. {error}"
+            warnings.warn(text, stacklevel=2)
+    return lock
 
 
 def _cure(
@@ -152,13 +181,19 @@ def _lock_for(
     *,
     builder: Builder | None,
     refresh: bool = False,
+    sources: Sequence[Source] = (),
 ) -> Lock:
-    """Resolves a request; each round builds packages without wheels and resolves their needs."""
+    """Resolves a request; each round builds packages without wheels and resolves their needs.
+    ``sources`` are built before, and taken.
+    """
     target = Target(python=interpreter.path)
     links: list[str] = []
     if builder is not None:
         request, links = _built_from_git(request, builder, interpreter, tell)
-    built: set[str] = set()
+        links += _links(builder(sources, interpreter, tell)) if sources else []
+        held = (parse_requirement(f"{one.name}=={one.version}", "the newest") for one in sources)
+        request = replace(request, constraints=(*request.constraints, *held))
+    built = {source.name for source in sources}
     while True:
         try:
             lock = resolve.resolve(request, target, options=links, refresh=refresh, tell=tell)

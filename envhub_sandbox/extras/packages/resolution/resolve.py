@@ -47,6 +47,7 @@ _BOUNDED = re.compile(
     r"(?<![\w.-])(?!python\b)([A-Za-z][A-Za-z0-9._-]*)(?:\[[\w,-]+\])?[<>=!~]=?\d", re.I
 )
 _NO_WHEELS = re.compile(r"Wheels are required for `([A-Za-z0-9._-]+)`")
+_NO_SOURCES = re.compile(r"A source distribution is required for `([a-z0-9-]+)`")
 _NEEDS_PYTHON = re.compile(r"does not satisfy Python>=(3\.\d+)")
 _HASH = re.compile(r"    --hash=(sha(?:256|384|512):[0-9a-f]+)( \\)?")
 
@@ -195,17 +196,44 @@ def sources_of(
 
     Ignores the needs of each source: they are known once its wheel is built.
     """
-    words = ["--config-file", "uv.toml", "--format", "pylock.toml", *links]
     known = sorted(names)
     while True:
         try:
-            text = _compiled(request, target, words, lambda line: None, _may_be_built(known))
-            break
+            return _sources(request, target, known, links)
         except DependencyError as error:  # uv names one package at a time
             further = set(without_wheels(error)).difference(known)
             if error.reason != "resolution" or not further or len(known) >= MOST_SOURCES:
                 raise
             known = sorted(further.union(known))
+
+
+def newer_sources(request: PackageRequest, lock: Lock, target: Target) -> list[Source]:
+    """Returns the sources that pip would build: of packages that a request names, the newest
+    releases, where the lock has older ones since only those have wheels. Builds nothing.
+    """
+    chosen = dict(pin.split("==") for pin in lock.packages)
+    named = {canonicalize_name(one.requirement.name): one for one in request.wanted}
+    left = {name: one for name, one in named.items() if name in chosen and one.is_open}
+    while left:
+        asked = replace(request, wanted=tuple(left.values()), runs_worker=False)
+        try:
+            sources = _sources(asked, target, sorted(left), ("--no-deps",))
+            newer = (one for one in sources if Version(one.version) > Version(chosen[one.name]))
+            return list(newer)
+        except DependencyError as error:  # uv names one package at a time
+            without = left.keys() & set(_NO_SOURCES.findall(str(error)))
+            if error.reason != "resolution" or not without:
+                return []
+            left = {name: one for name, one in left.items() if name not in without}
+    return []
+
+
+def _sources(
+    request: PackageRequest, target: Target, names: Iterable[str], words: Sequence[str]
+) -> list[Source]:
+    """Returns the sources of these packages, as uv chooses them; raises as ``resolve``."""
+    words = ["--config-file", "uv.toml", "--format", "pylock.toml", *words]
+    text = _compiled(request, target, words, lambda line: None, _may_be_built(names))
     rows = toml.loads(text, len(text), generated=True).get("packages", [])
     return [
         Source(row["name"], row["version"], sdist["url"], sdist["hashes"]["sha256"])
@@ -215,17 +243,21 @@ def sources_of(
 
 
 def uploaded(wanted: WantedPackage, python: str) -> str:
-    """Returns the day of the chosen release; empty if the index does not state it."""
+    """Returns the day of the newest release, by a wheel or a source; empty if the index states
+    none.
+    """
     request, words = PackageRequest("", (wanted,), runs_worker=False), ("--format", "pylock.toml")
     ask = partial(_compiled, request, Target(python=python), tell=lambda line: None)
-    try:
-        text = ask([*uv.NO_BUILDS, "--no-deps", *words])
-    except DependencyError as error:
-        names = without_wheels(error)
-        if not names:
-            raise
-        sources = ["--config-file", "uv.toml", "--no-deps", *words]
-        text = ask(sources, settings=_may_be_built(names))
+    built = _may_be_built([canonicalize_name(wanted.requirement.name)])
+    texts, failed = list[str](), list[DependencyError]()
+    for way, settings in ((uv.NO_BUILDS, {}), (("--config-file", "uv.toml"), built)):
+        try:
+            texts.append(ask([*way, "--no-deps", *words], settings=settings))
+        except DependencyError as error:
+            failed.append(error)
+    if not texts:
+        raise failed[0]
+    text = max(texts, key=lambda text: Version(re.findall(r'(?m)^version = "(.+)"', text)[0]))
     days = re.findall(r"upload-time = [^\d]{0,40}(\d{4}-\d{2}-\d{2})", text)
     return max(days, default="")
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.extras.packages import interpreters, packages
 from envhub_sandbox.extras.packages.declared import Source, of_git, parse_requirement
 from envhub_sandbox.extras.packages.interpreters import Interpreter
@@ -107,6 +108,34 @@ def test_two_packages_without_wheels_in_one_file(
     found = resolution_for(request("third-source==1.5", "only-source==1.5")).lock.packages
     assert {"only-source==1.5", "deeper-source==1.5", "third-source==1.5"} <= set(found)
     assert len(built) == len({one.name for one in built})
+
+
+def test_what_is_named_is_as_new_as_pip_has_it(
+    index: Index, tmp_path: Path, built: list[Source], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is built if only older releases have wheels, and no bound or date keeps the newest away.
+    What others need has a wheel if it can. Where the build fails, the older one stays."""
+    for name in ("half-source", "needed", "only-wheel"):
+        make_wheel(index.folder, name, "1.0", requires=["needed"] * (name == "half-source"))
+    for name in ("half-source", "needed", "deeper-source"):
+        source_distribution(index.folder, name, "2.0", tmp_path / "ran")
+    found = resolution_for(request("only-wheel", "half-source>=1")).lock.packages
+    assert {"half-source==2.0", "deeper-source==2.0"} <= set(found)
+    assert [one.name for one in built] == ["half-source", "deeper-source"]
+    found = resolution_for(request("only-wheel", "half-source<2")).lock.packages
+    assert {"half-source==1.0", "needed==1.0"} <= set(found)
+    dated = replace(request("half-source"), exclude_newer="2020-01-01")
+    index.uploaded |= {path.name: "2019-01-01" for path in index.folder.iterdir()}
+    index.uploaded["half_source-2.0.tar.gz"] = "2021-01-01"
+    assert "half-source==1.0" in resolution_for(dated).lock.packages
+
+    def fails(*given: object) -> list[Path]:
+        raise DependencyError("it needs gcc", reason="resolution")
+
+    monkeypatch.setattr(resolutions, "BUILDER", fails)
+    with pytest.warns(UserWarning, match=r"^half-source==1.0 is installed, .* it needs gcc"):
+        found = resolution_for(request("only-wheel", "half-source")).lock.packages
+    assert "half-source==1.0" in found
 
 
 def test_without_a_builder_there_are_wheels_alone(

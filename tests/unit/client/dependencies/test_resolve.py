@@ -219,16 +219,19 @@ def test_no_password_of_an_index_is_in_an_error(
 
 
 def test_only_uploads_before_a_date(index: Index, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the repository's packages; the worker's may be as new as it needs them, and no newer. A
-    source has a day as a wheel has."""
+    """Of the repository's packages; the worker's may be as new as it needs them, and no newer. The
+    day of a release is that of the newest, be it a source."""
     make_sdist(index.folder, "unbuilt")
+    make_sdist(index.folder, "unbuilt", "2.0")
+    make_wheel(index.folder, "unbuilt", "1.5")
     wheels = [make_wheel(index.folder, "ages", version) for version in ("1.0", "2.0")]
     make_wheel(index.folder, "cloudpickle", "99.0")
     days = {path.name: "2020-01-01" for path in index.folder.iterdir()}
     days[f"cloudpickle-{WORKERS['cloudpickle']}-py3-none-any.whl"] = "2023-10-16"
     days |= {"cloudpickle-99.0-py3-none-any.whl": "2025-01-01", wheels[1].name: "2023-02-01"}
+    days["unbuilt-2.0.tar.gz"] = "2022-01-01"
     monkeypatch.setattr(index, "uploaded", days)
-    for name, day in (("ages", "2023-02-01"), ("unbuilt", "2020-01-01")):
+    for name, day in (("ages", "2023-02-01"), ("unbuilt", "2022-01-01")):
         assert module.uploaded(parse_requirement(name, "x"), sys.executable) == day
     found = resolve("ages", exclude_newer="2023-01-05").packages
     assert {"ages==1.0", f"cloudpickle=={WORKERS['cloudpickle']}"} <= set(found)
