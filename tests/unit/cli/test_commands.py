@@ -135,10 +135,7 @@ def test_a_report_is_not_written_through_a_link_of_the_repository() -> None:
     Path("env/sub").mkdir()
     Path("env/sub/env.py").touch()
     Path("victim").write_text("mine")
-    for words in (
-        *("inspect ./env --static", "check ./env --deadline 1"),
-        *("inspect ./env/sub --static", "check ./env/sub --deadline 1"),
-    ):
+    for words in ("inspect ./env --static", "check ./env/sub --deadline 1"):
         said(*words.split(), "--sarif", "env/new")
         assert Path("env/new").read_text().startswith("{")
         Path("env/new").unlink()

@@ -74,7 +74,7 @@ def test_packages_lie_behind_the_standard_library(cell: Cell) -> None:
 def test_packages_are_as_deep_as_paths_go(folder: Path, runtime: Runtime) -> None:
     """A stranger has chosen how deep: deeper than functions of Python call each other."""
     deepest = runtime.packages
-    for _ in range(1500):
+    for _ in range(sys.getrecursionlimit() + 100):
         deepest += "/d"
         os.mkdir(deepest)
     with spawner_in(folder, STRICT, runtime=runtime) as spawner:
