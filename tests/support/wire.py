@@ -1,6 +1,7 @@
 """Hand-made messages, for tests of what a hostile or older peer may send."""
 
 import struct
+from collections.abc import Callable, Iterable
 from typing import Any
 from unittest.mock import Mock
 
@@ -10,6 +11,7 @@ from gymnasium.vector.utils import batch_space
 from envhub_sandbox.transport.jail import JailHandle, Request
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
+from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.reader import Space, SpaceReader
@@ -49,6 +51,18 @@ def env_manifest(observation: Space, action: Space, count: int, /, **changes: An
         "type_name": "gymnasium.vector.AsyncVectorEnv",
     }
     return EnvManifest(**(fields | changes))
+
+
+def not_refused(read: Callable[[Any], object], lies: Iterable[Any]) -> list[Any]:
+    """The lies that are read without a ``RemoteProtocolError``."""
+    taken = []
+    for lie in lies:
+        try:
+            read(lie)
+        except RemoteProtocolError:
+            continue
+        taken.append(lie)
+    return taken
 
 
 def ext(code: int, payload: bytes = b"") -> msgpack.ExtType:

@@ -67,23 +67,22 @@ def test_nested_values_arrive_with_their_types(value: object) -> None:
     assert_same(value, through(value))
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        2**63, 2**64 - 1, 2**64, -(2**63), -(2**63) - 1, 2**4000, -0.0, float("inf"), float("nan"),
-        complex("1-infj"), "", "\0", "\U0001f600", b"", [], (), {}, set(), frozenset(), ((),),
-        {(): {None: ()}}, {1: "a", "1": "b"}, {b"k": 1}, slice(None), slice(1, (2,), "x"),
-        range(0), range(5, -5, -2), np.float64(1.5), np.float16("nan"), np.bool_(False),
-        np.str_("é"), np.str_(""), np.bytes_(b"ab"), np.datetime64("2020-01-01T00", "h"),
-        np.timedelta64(5, "ms"), np.array(None), np.zeros((0, 3), dtype=object),
-        {"r": [np.array([1]), {"s": (np.float32(1), None)}]},
-        objects([1, 2], np.zeros(3), np.array(5), (1,)).reshape(2, 2), deep(32),
-        [deep(31), ["x" * 100] * 400],
-    ],
-    ids=repr,
-)  # fmt: skip
-def test_corner_values_arrive_with_their_types(value: object) -> None:
-    assert_same(value, through(value))
+CORNERS = [
+    2**63, 2**64 - 1, 2**64, -(2**63), -(2**63) - 1, 2**4000, -0.0, float("inf"), float("nan"),
+    complex("1-infj"), "", "\0", "\U0001f600", b"", [], (), {}, set(), frozenset(), ((),),
+    {(): {None: ()}}, {1: "a", "1": "b"}, {b"k": 1}, slice(None), slice(1, (2,), "x"),
+    range(0), range(5, -5, -2), np.float64(1.5), np.float16("nan"), np.bool_(False),
+    np.str_("é"), np.str_(""), np.bytes_(b"ab"), np.datetime64("2020-01-01T00", "h"),
+    np.timedelta64(5, "ms"), np.array(None), np.zeros((0, 3), dtype=object),
+    {"r": [np.array([1]), {"s": (np.float32(1), None)}]},
+    objects([1, 2], np.zeros(3), np.array(5), (1,)).reshape(2, 2), deep(32),
+    [deep(31), ["x" * 100] * 400],
+]  # fmt: skip
+
+
+def test_corner_values_arrive_with_their_types() -> None:
+    for value in CORNERS:
+        assert_same(value, through(value), repr(value)[:60])
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Manifests: what a repository returned arrives as it was; lies about it do not."""
 
 import dataclasses
+import itertools
 from typing import Any
 
 import pytest
@@ -22,7 +23,7 @@ from envhub_worker.protocol.manifest.manifest import (
 )
 from envhub_worker.protocol.manifest.names import MAX_NAME, MAX_NAMES
 from tests.support.decode import decode
-from tests.support.wire import env_manifest
+from tests.support.wire import env_manifest, not_refused
 
 ELEMENTS = 40_000
 OBSERVATION = spaces.Dict({"b": spaces.Box(-1, 1, (3,)), "a": spaces.Text(4)})
@@ -91,11 +92,10 @@ def test_only_a_vector_environment_with_a_step_of_its_own_decides_what_a_batch_i
     assert an_env(action_space=other).own_batch("action_space") is None
 
 
-@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(EnvManifest)])
-@pytest.mark.parametrize("lie", [b"bytes", 1.5, {3: 4}, [[]], object], ids=repr)
-def test_fields_of_another_type_are_refused(name: str, lie: object) -> None:
-    with pytest.raises(RemoteProtocolError):
-        read(with_env(name, lie))
+def test_fields_of_another_type_are_refused() -> None:
+    names = [field.name for field in dataclasses.fields(EnvManifest)]
+    lies = itertools.product(names, (b"bytes", 1.5, {3: 4}, [[]], object))
+    assert not_refused(lambda lie: read(with_env(*lie)), lies) == []
 
 
 LONG = "x" * (MAX_NAME + 1)
@@ -116,26 +116,17 @@ LIES: dict[str, tuple[object, ...]] = {
 }
 
 
-@pytest.mark.parametrize(("name", "lie"), [(n, lie) for n, lies in LIES.items() for lie in lies])
-def test_impossible_values_are_refused(name: str, lie: object) -> None:
-    with pytest.raises(RemoteProtocolError):
-        read(with_env(name, lie))
+def test_impossible_values_are_refused() -> None:
+    lies = [(name, lie) for name, lies in LIES.items() for lie in lies]
+    assert not_refused(lambda lie: read(with_env(*lie)), lies) == []
 
 
-@pytest.mark.parametrize("lie", [None, [], (), {}, {"envs": ()}, "manifest", 3])
-def test_what_is_no_manifest_is_refused(lie: object) -> None:
-    with pytest.raises(RemoteProtocolError):
-        read(lie)
-
-
-@pytest.mark.parametrize("name", ["envs", "lazy", "interpreter", "packages"])
-def test_missing_and_unknown_fields_are_refused(name: str) -> None:
-    missing, unknown = value_of(), value_of()
-    del missing[name]
-    unknown["extra"] = 1
-    for lie in (missing, unknown, {**value_of(), name: None}):
-        with pytest.raises(RemoteProtocolError):
-            read(lie)
+def test_what_is_no_manifest_is_refused() -> None:
+    lies: list[Any] = [None, [], (), {}, {"envs": ()}, "manifest", 3, {**value_of(), "extra": 1}]
+    for name in ("envs", "lazy", "interpreter", "packages"):
+        lies.append({**value_of(), name: None})
+        lies.append({key: value for key, value in value_of().items() if key != name})
+    assert not_refused(read, lies) == []
 
 
 @pytest.mark.parametrize("envs", [(), (None,) * (MAX_ENVS + 1)], ids=["none", "too many"])
@@ -157,9 +148,8 @@ def test_spaces_of_absurd_size_are_refused_before_they_are_built() -> None:
 
 
 def test_package_versions_are_short_text() -> None:
-    for lie in ({"numpy": 2}, {"numpy": "x" * (MAX_NAME + 1)}, {2: "numpy"}, []):
-        with pytest.raises(RemoteProtocolError):
-            read({**value_of(), "packages": lie})
+    lies = ({"numpy": 2}, {"numpy": "x" * (MAX_NAME + 1)}, {2: "numpy"}, [])
+    assert not_refused(lambda lie: read({**value_of(), "packages": lie}), lies) == []
 
 
 plain = st.recursive(

@@ -27,7 +27,7 @@ from envhub_worker.protocol.spaces.spaces import (
 )
 from tests.support.compare import assert_same
 from tests.support.decode import decode
-from tests.support.wire import decode_space
+from tests.support.wire import decode_space, not_refused
 
 Space = gym.Space[Any]
 INF = float("inf")
@@ -146,14 +146,10 @@ NESTED = [
 ALL = [*BOXES, *OTHERS, *NESTED, *([OneOf([BOXES[0], OTHERS[0]])] if OneOf else [])]
 
 
-@pytest.mark.parametrize("space", ALL, ids=repr)
-def test_space_arrives_with_every_attribute(space: Space) -> None:
-    assert_crosses(space)
-
-
-@pytest.mark.parametrize("space", ALL, ids=repr)
-def test_batched_space_arrives_with_every_attribute(space: Space) -> None:
-    assert_crosses(batch_space(space, 3))
+@pytest.mark.parametrize("batched", [False, True])
+def test_spaces_arrive_with_every_attribute(batched: bool) -> None:
+    for space in ALL:
+        assert_crosses(batch_space(space, 3) if batched else space)
 
 
 def test_one_of_is_opaque_where_gymnasium_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -423,40 +419,37 @@ def lies(honest: dict[str, Any], **fields: Iterable[object]) -> list[dict[str, A
     return [honest | {name: lie} for name, values in fields.items() for lie in values]
 
 
-@pytest.mark.parametrize(
-    "value",
-    [
-        *(None, [], {}, {"kind": 1}, {"kind": []}, {"kind": "Box"}, {"kind": "os.system"}),
-        *(without(BOX, "low"), BOX | {"seed": 1}),
-        *lies(BOX, dtype=("object", "V2000000000", "float128", None, "int64")),
-        *lies(BOX, shape=([2], (-1,), (2.0,), (True,), (np.int64(2),), (2**31,), (1,) * 33, None)),
-        *lies(BOX, low=(0.0, None, np.float32(0), np.array(0.0), np.array([0, 0, 0], "f4"))),
-        *lies(BOX, low=(np.array([[0, 0]], "f4"), np.array(["x"], object), np.array(2, "f4"))),
-        BOX | dict.fromkeys(("low", "high"), np.array(np.nan, "f4")),
-        *lies(BOX, bounded_below=(ONE, True), bounded_above=[np.array([True, True, False])]),
-        *lies(DISCRETE, n=(0, -1, 2.0, True, 2**63, 2**200), dtype=("float32", "bool")),
-        *lies(DISCRETE, start=(None, 2**63 - 2, -(2**63) - 1)),
-        DISCRETE | {"dtype": "int8", "n": 200},
-        *lies(MULTI, nvec=map(np.array, ([2, 0], [2, -3], [2.0, 3.0], [2, 3, 4]))),
-        *lies(MULTI, start=[np.array([0, 0, 0])], dtype=["float64"]),
-        *lies({"kind": "multi_binary"}, n=(0, -1, 2.5, (0,), (2, "x"), np.array([2]))),
-        *lies(TEXT, characters=("aa", ["ab"], "a\ud800")),
-        *lies(TEXT, min_length=(-1, 4), max_length=(3.0, None)),
-        *lies(DICT, keys=(["a"], ["a", "a"], ["a", []], ("a", "b"), [1, True]), sort_keys=[1]),
-        DICT | {"spaces": {"a": DISCRETE, "b": DISCRETE}},
-        *lies({"kind": "tuple"}, spaces=(None, [None], [spaces.Discrete(2)])),
-        {"kind": "one_of", "spaces": [{"kind": "one_of", "spaces": 3}]},
-        {"kind": "sequence", "space": None, "stack": False},
-        {"kind": "sequence", "space": DISCRETE, "stack": 1},
-        *lies({"kind": "graph", "node": None}, edge=[None]),
-        *lies({"kind": "graph", "node": DISCRETE}, edge=[5]),
-        *lies(OPAQUE, type=[1], text=[None], dtype=[np.float32], shape=[(2**40,)]),
-    ],
-    ids=lambda value: repr(value)[:60],
-)
-def test_malformed_description_is_refused(value: object) -> None:
-    with pytest.raises(RemoteProtocolError):
-        decode_space(value, max_elements=MANY)
+MALFORMED = [
+    *(None, [], {}, {"kind": 1}, {"kind": []}, {"kind": "Box"}, {"kind": "os.system"}),
+    *(without(BOX, "low"), BOX | {"seed": 1}),
+    *lies(BOX, dtype=("object", "V2000000000", "float128", None, "int64")),
+    *lies(BOX, shape=([2], (-1,), (2.0,), (True,), (np.int64(2),), (2**31,), (1,) * 33, None)),
+    *lies(BOX, low=(0.0, None, np.float32(0), np.array(0.0), np.array([0, 0, 0], "f4"))),
+    *lies(BOX, low=(np.array([[0, 0]], "f4"), np.array(["x"], object), np.array(2, "f4"))),
+    BOX | dict.fromkeys(("low", "high"), np.array(np.nan, "f4")),
+    *lies(BOX, bounded_below=(ONE, True), bounded_above=[np.array([True, True, False])]),
+    *lies(DISCRETE, n=(0, -1, 2.0, True, 2**63, 2**200), dtype=("float32", "bool")),
+    *lies(DISCRETE, start=(None, 2**63 - 2, -(2**63) - 1)),
+    DISCRETE | {"dtype": "int8", "n": 200},
+    *lies(MULTI, nvec=map(np.array, ([2, 0], [2, -3], [2.0, 3.0], [2, 3, 4]))),
+    *lies(MULTI, start=[np.array([0, 0, 0])], dtype=["float64"]),
+    *lies({"kind": "multi_binary"}, n=(0, -1, 2.5, (0,), (2, "x"), np.array([2]))),
+    *lies(TEXT, characters=("aa", ["ab"], "a\ud800")),
+    *lies(TEXT, min_length=(-1, 4), max_length=(3.0, None)),
+    *lies(DICT, keys=(["a"], ["a", "a"], ["a", []], ("a", "b"), [1, True]), sort_keys=[1]),
+    DICT | {"spaces": {"a": DISCRETE, "b": DISCRETE}},
+    *lies({"kind": "tuple"}, spaces=(None, [None], [spaces.Discrete(2)])),
+    {"kind": "one_of", "spaces": [{"kind": "one_of", "spaces": 3}]},
+    {"kind": "sequence", "space": None, "stack": False},
+    {"kind": "sequence", "space": DISCRETE, "stack": 1},
+    *lies({"kind": "graph", "node": None}, edge=[None]),
+    *lies({"kind": "graph", "node": DISCRETE}, edge=[5]),
+    *lies(OPAQUE, type=[1], text=[None], dtype=[np.float32], shape=[(2**40,)]),
+]
+
+
+def test_malformed_descriptions_are_refused() -> None:
+    assert not_refused(lambda value: decode_space(value, max_elements=MANY), MALFORMED) == []
 
 
 def test_description_of_a_custom_space_is_cleaned() -> None:
