@@ -7,10 +7,12 @@ import pickle
 import subprocess
 import sys
 from dataclasses import field
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from envhub_worker import bootstrap
 from envhub_worker.protocol import records
 
 
@@ -140,17 +142,19 @@ def test_copies_are_equal() -> None:
     assert copy.deepcopy(record) == pickle.loads(pickle.dumps(record)) == record
 
 
-def test_zygote_is_started_before_inspect_is_imported() -> None:
+def test_a_server_imports_next_to_nothing_before_its_zygote(tmp_path: Path) -> None:
     """What stands before it in a server's start takes time that nothing else does."""
     program = (
-        "import sys, envhub_worker.__main__, envhub_worker.spawn.zygote_process;"
-        "print('inspect' in sys.modules, 'argparse' in sys.modules)"
+        "import runpy, subprocess, sys\n"
+        "subprocess.Popen = lambda command, **_: sys.exit(print(command[-3], *sys.modules))\n"
+        f"sys.argv = [{bootstrap.__file__!r}, 'worker', 'serve', '--ahead', '--endpoint', 'ipc://x',"
+        f" '--runtime-dir', {str(tmp_path)!r}]\n"
+        "runpy.run_path(sys.argv[0], run_name='__main__')"
     )
     found = subprocess.run(
-        [sys.executable, "-S", "-c", program],
-        env={"PYTHONPATH": records.__file__.rsplit("/envhub_worker/", 1)[0]},
-        capture_output=True,
-        text=True,
-        check=True,
+        [sys.executable, "-I", "-S", "-c", program], stdout=subprocess.PIPE, text=True, check=True
     )
-    assert found.stdout.split() == ["False", "True"]
+    what, *modules = found.stdout.split()
+    assert what == "zygote"
+    assert "argparse" in modules
+    assert not {"email", "importlib.metadata", "inspect", "zipfile", "zmq"} & {*modules}

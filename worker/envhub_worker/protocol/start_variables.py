@@ -34,10 +34,8 @@ _STARTED_WITH = {
     r"(NPY|NUMPY)_\w+": r"[\w, ]*",
     r"OPENBLAS_(?!NUM_THREADS|DEFAULT_NUM_THREADS)\w+": r"\w*",
 }
-_VALUES = {
-    re.compile(name, re.ASCII): re.compile(_STARTED_WITH[name], re.ASCII) for name in _STARTED_WITH
-}
-_REFUSED = re.compile(
+# Compiled by ``re`` at their first use: a server and its zygote start without.
+_REFUSED = (
     "LD_(ASSUME_KERNEL|AUDIT|BIND_NOT|BIND_NOW|DEBUG|DEBUG_OUTPUT|DYNAMIC_WEAK|HWCAP_MASK|"
     "LIBRARY_PATH|ORIGIN_PATH|POINTER_GUARD|PREFER_MAP_32BIT_EXEC|PRELOAD|PROFILE|PROFILE_OUTPUT|"
     "SHOW_AUXV|TRACE_LOADED_OBJECTS|USE_LOAD_BIAS|VERBOSE|WARN)|GCONV_PATH|GLIBC_TUNABLES|LOCPATH|"
@@ -47,23 +45,24 @@ _REFUSED = re.compile(
 )
 
 
-def _values_of(name: str) -> re.Pattern[str] | None:
-    """Returns the allowed values of a variable that is read at start; None for other variables."""
-    return next((values for names, values in _VALUES.items() if names.fullmatch(name)), None)
+def _values_of(name: str) -> str | None:
+    """Returns the pattern of a variable that is read at start; None for other variables."""
+    allowed = _STARTED_WITH.items()
+    return next((values for names, values in allowed if re.fullmatch(names, name, re.ASCII)), None)
 
 
 def why_not(name: str, value: str = "") -> str:
     """Why a jail cannot have this variable with this value; empty if it can."""
     values = _values_of(name)
     if values is None:
-        if not _REFUSED.fullmatch(name):
+        if not re.fullmatch(_REFUSED, name):
             return ""
         return (
             "is read when a process starts, and those of a jail are forked from one that has "
             "started: it would do nothing. Have env.py set it for the processes that it starts, or "
             "do there what it says"
         )
-    if values.fullmatch(value):
+    if re.fullmatch(values, value, re.ASCII):
         return ""
     return (
         f"is {value!r}: a process that is not confined yet is started with it, which takes only "

@@ -10,7 +10,6 @@ batch's, False if it is one sub-environment's, None if the observation fits neit
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -18,6 +17,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 from envhub_worker.runner import gymnasium_compat as compat
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+from envhub_worker.protocol.records import dataclass
 
 # Codes of <linux/bpf_common.h>, composed.
 LOAD = 0x20
