@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-
-from envhub_worker.protocol.records import dataclass
+from typing import NamedTuple
 
 # Codes of <linux/bpf_common.h>, composed.
 LOAD = 0x20
@@ -19,23 +18,20 @@ JUMP_GREATER_OR_EQUAL = 0x35
 _MAX_INSTRUCTIONS = 4096
 
 
-@dataclass(frozen=True)
-class Label:
+class Label(NamedTuple):
     """A position that branches jump to."""
 
     name: str
 
 
-@dataclass(frozen=True)
-class Do:
+class Do(NamedTuple):
     """An instruction: ``LOAD`` the word at offset ``k``, ``AND`` it with ``k``, or ``RETURN`` k."""
 
     code: int
     k: int
 
 
-@dataclass(frozen=True)
-class Branch:
+class Branch(NamedTuple):
     """A conditional jump that compares the accumulator with ``k``; a target None falls through."""
 
     code: int
@@ -49,8 +45,7 @@ class Branch:
         return [target for target in (self.if_true, self.if_false) if target is not None]
 
 
-@dataclass(frozen=True)
-class BpfInstruction:
+class BpfInstruction(NamedTuple):
     """One ``struct sock_filter``."""
 
     code: int
