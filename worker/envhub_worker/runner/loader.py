@@ -186,7 +186,8 @@ def _make_importable(root: Path, folder: Path, scratch: str, package_path: Path)
     fresh = dict.fromkeys(os.fspath(item) for item in wanted)
     sys.path[:0] = [item for item in fresh if item not in sys.path]
     sys.dont_write_bytecode = True  # the snapshot is read-only
-    importlib.invalidate_caches()
+    for item in fresh:  # not invalidate_caches(), after which each folder of packages is read again
+        sys.path_importer_cache.pop(item, None)
 
 
 def _check_arguments(
