@@ -298,7 +298,7 @@ def _record_of(item: Any, repo: Repository) -> FileRecord | None:
         ):
             path.encode()  # raises for a lone surrogate, which cannot be in a file's name
             return FileRecord(path, size, f"{kind}:{digest}")
-        raise ValueError("a field is not what it should be")
+        raise ValueError("a field has a wrong type")
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise SnapshotIntegrityError(
             f"{repo.repo_id}: the Hub's listing has an entry that cannot be read ({error!r}); "

@@ -345,7 +345,7 @@ class _Candidate:
             raise SnapshotError(f"{slot.title}: it was removed from the store meanwhile; try again")
         if self.public and not store.is_public(slot) and not self._note_whether_public(slot):
             reason = f"the {self.repo.repo_type} repository is not given without a login"
-            raise HubFailure(Kind.GATED, reason, "Only what needs none is taken here")
+            raise HubFailure(Kind.GATED, reason, "Only those without a login are used here")
         return self._finished(slot, files)
 
     def _note_whether_public(self, slot: store.Slot) -> bool:

@@ -367,7 +367,7 @@ def _refuse_shared_store(store: Path) -> None:
     try:
         why = folders.why_distrusted(store, root)
     except PermissionError as error:
-        raise SnapshotError(f"the snapshot store {root} cannot be looked at: {error}") from error
+        raise SnapshotError(f"the snapshot store {root} cannot be read: {error}") from error
     if why:
         raise SnapshotError(
             f"the snapshot store {root} is not trusted, because other users can change it: {why}; "

@@ -83,7 +83,7 @@ def check_reply(reply: m.Message) -> None:
     if isinstance(reply, m.RaisedException):
         raise raised(reply)
     if reply.kind < m.FIRST_RUNNER_KIND:
-        raise RemoteProtocolError(f"a runner sent {type(reply).__name__}")
+        raise RemoteProtocolError(f"a runner sent {type(reply).__name__}, as a server does")
 
 
 def typed_reply(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.M:
@@ -93,7 +93,7 @@ def typed_reply(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.
     kinds = kind if isinstance(kind, tuple) else (kind,)
     wanted = " or ".join(kind.__name__ for kind in kinds)
     raise RemoteProtocolError(
-        f"the worker answered with {type(reply).__name__} where {wanted} belongs"
+        f"the worker answered with {type(reply).__name__} instead of {wanted}"
     )
 
 

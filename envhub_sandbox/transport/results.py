@@ -226,7 +226,7 @@ class Results:
         gathered: list[Any] = []
         for reply, size in zip(replies, self._sizes, strict=True):
             if type(reply.value) is not tuple or len(reply.value) != size:
-                raise RemoteProtocolError(f"the worker's {operation} does not hold one result each")
+                raise RemoteProtocolError(f"the worker's {operation} does not have one result each")
             gathered += reply.value
         return tuple(gathered)
 
@@ -266,9 +266,9 @@ def _own_infos(value: Any, size: int) -> Sequence[OwnInfo]:
         if type(own) is not tuple or list(map(type, own)) != [int, dict, dict]:
             raise RemoteProtocolError(_NOT_ONE_EACH)
         if not 0 <= own[0] < size:
-            raise RemoteProtocolError("the worker's infos are of no sub-environment")
+            raise RemoteProtocolError("the worker's infos are of an unknown sub-environment")
         if not batches.are_forms(own[2]):
-            raise RemoteProtocolError("the worker's infos are of no form")
+            raise RemoteProtocolError("the worker's infos have an unknown form")
     return cast("Sequence[OwnInfo]", each)
 
 

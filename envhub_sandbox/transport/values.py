@@ -161,7 +161,7 @@ class DescriptionReader:
         if code == GENERATOR:
             self._reader.spend(GENERATOR_BYTES)
             return generator(value)
-        raise RemoteProtocolError(f"nothing is described by {code}")
+        raise RemoteProtocolError(f"the worker sent a description of unknown code {code}")
 
 
 unpacked = partial(m.unpack, tensors=to_tensor, things=DescriptionReader)
@@ -229,7 +229,7 @@ def _pickler() -> Any:
             if self.lasting and isinstance(value, (type, FunctionType)):
                 package = str(value.__module__).partition(".")[0]
                 if package not in _INSTALLED and package not in sys.stdlib_module_names:
-                    raise TypeError(f"{value.__qualname__} may be another one by the next time")
+                    raise TypeError(f"{value.__qualname__} may be another object next time")
             if type(value) is memoryview:
                 plain = value.readonly and value.format == "B" and value.ndim == 1
                 return memoryview, (bytes(value) if plain else np.array(value),)

@@ -106,7 +106,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         many wrappers.
         """
         if self._depth is not None and self._depth >= _MOST_WRAPPERS:
-            raise RemoteProtocolError(f"the worker says that more than {_MOST_WRAPPERS} wrap one")
+            raise RemoteProtocolError(f"the worker reports more than {_MOST_WRAPPERS} wrappers")
         wrapped = self._get("env")
         if self._depth is None or not (callable(wrapped) or isinstance(wrapped, RemoteObject)):
             return wrapped

@@ -559,8 +559,8 @@ def refuse_limit(env: SandboxVectorEnv, steps: int | None) -> None:
     own = env._spec_again(env._manifest.spec).max_episode_steps
     if steps not in (None, own):
         raise ValueError(
-            f"{env}: its episodes are of {own or 'any number of'} steps, and not of {steps}: a "
-            "limit is the repository's, or a gymnasium.wrappers.TimeLimit around SandboxEnv"
+            f"{env}: max_episode_steps={steps} is not the repository's limit, {own}. Leave it out, "
+            "or put a gymnasium.wrappers.TimeLimit around SandboxEnv"
         )
 
 

@@ -108,7 +108,7 @@ def test_few_files_are_begun_at_once(uploads: Uploads, monkeypatch: pytest.Monke
     monkeypatch.setattr(f"{Uploads.__module__}.MAX_PARTIAL", 1)
     uploads.offer(OWNER, ALICE, offer(("a", b"12345"), ("b", b"54321")), ())
     uploads.put(OWNER, ALICE, m.PutBlob(sha256(b"12345"), 0), b"1234")
-    with refused("on their way already"):
+    with refused("being uploaded already"):
         uploads.put(OWNER, ALICE, m.PutBlob(sha256(b"54321"), 0), b"5432")
 
 
@@ -232,7 +232,7 @@ def test_snapshots_and_folders_are_counted(tmp_path: Path, monkeypatch: pytest.M
     assert (Path(first).exists(), Path(second).exists()) == (False, True)
     deep = "/".join(["x"] * 60)
     files = tuple((f"{number}/{deep}", 0, bytes(32)) for number in range(4000))
-    with refused("steps"):
+    with refused("parts of paths"):
         uploads.offer(OWNER, ALICE, m.OfferSnapshot(files), ())
 
 

@@ -142,7 +142,7 @@ def _death(death: dict[str, Any]) -> dict[str, Any]:
 
 def _task(task: Any) -> dict[str, Any]:
     if type(task) is not dict or type(task.get("task")) not in (int, str):
-        raise BundleError("its task is not one")
+        raise BundleError("its task has no number or name")
     return {
         "suite": _member(task, "suite", str),
         "task": task["task"],

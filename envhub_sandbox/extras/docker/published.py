@@ -92,7 +92,7 @@ def _server_key(answer: bytes) -> bytes:
         return parse_key(str(json.loads(answer)["server_key"]))
     except (KeyError, ValueError) as error:
         raise WorkerStartupError(
-            "the container's program is no envhub-worker of this version; build the image again"
+            "the container's program is not envhub-worker of this version; build the image again"
         ) from error
 
 

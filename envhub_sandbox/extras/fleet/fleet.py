@@ -80,7 +80,7 @@ class Fleet(Sandbox):
 
         def sandbox_of(sandbox: str | Sandbox) -> Sandbox:
             if is_fleet(sandbox):
-                raise PolicyError("a fleet's places are named one by one: no fleet is one")
+                raise PolicyError("a fleet cannot be a place of a fleet: name its places")
             if isinstance(sandbox, str) and sandbox.startswith("tcp://"):
                 return RemoteSandbox(sandbox, **self.remote)
             return resolve(sandbox)

@@ -192,9 +192,9 @@ def parse_requirement(text: str, where: str) -> WantedPackage:
     try:
         requirement = Requirement(plain)
         if not all(matches):
-            raise InvalidRequirement("a hash that is none")
+            raise InvalidRequirement("a malformed hash")
         if not _is_literal(plain):
-            raise InvalidRequirement("a text that would be printed as something else")
+            raise InvalidRequirement("a character that is not printed as itself")
     except (InvalidRequirement, RecursionError) as error:
         raise _unsupported(
             f"{where} is {text[:200]!r}. Only plain requirements such as 'numpy>=2' are supported, "

@@ -118,11 +118,11 @@ def _request(order: Mapping[str, Any]) -> PackageRequest:
         check_versions(python or ">=3")
         check_versions(order["supports"] or ">=3")
         if os.sep in python + order["supports"] or (until and not re.fullmatch(DATE, until)):
-            raise ValueError("a path, or no date")
+            raise ValueError("a path, or an invalid date")
     except ValueError as error:
         raise DependencyError(
-            "the client asks for versions of Python that are none, for an interpreter by its path, "
-            "or for a date that is none",
+            "the client asks for an invalid range of Python versions, for an interpreter by its "
+            "path, or for an invalid date",
             reason="requirement",
         ) from error
     left_out = ((name, "without, of the client") for [name] in order["without"])

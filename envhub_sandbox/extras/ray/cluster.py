@@ -209,7 +209,7 @@ def read_answer(answer: object) -> dict[str, Any]:
                 return said
     except (ValueError, RecursionError):
         pass
-    raise WorkerStartupError("an actor on a node of Ray gave an answer that is none of ours")
+    raise WorkerStartupError("an actor on a node of Ray gave an answer of another program")
 
 
 def _one_line(text: str) -> str:

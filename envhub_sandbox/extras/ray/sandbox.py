@@ -259,4 +259,4 @@ def read_started(said: Mapping[str, Any]) -> tuple[str, bytes, str, tuple[int, .
             return endpoint, parse_key(key), node, tuple(gpus[:64])
     except (AttributeError, LookupError, TypeError, ValueError):
         pass
-    raise WorkerStartupError("an actor on a node of Ray has started something that is no server")
+    raise WorkerStartupError("an actor on a node of Ray has not started a worker server")

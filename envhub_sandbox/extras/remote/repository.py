@@ -97,7 +97,7 @@ def upload(
     _put(client, root, missing, deadline)
     wanted = _offer(client, files, deadline)
     if wanted.hashes:
-        raise WorkerError("the server has taken the snapshot's files and still wants some")
+        raise WorkerError("the server has all files of the snapshot, and still asks for some")
     return wanted.snapshot, sum(file.size for file in missing)
 
 
@@ -229,7 +229,7 @@ def request_packages(
         if found.state == "made":
             return PackageSet(_name(found.name), _facts(found.facts, order))
         if found.state != "making":
-            raise RemoteProtocolError("the server has packages in a state that there is not")
+            raise RemoteProtocolError("the server reports an unknown state of packages")
         line = printable(found.progress[:_MAX_CHARS], _MAX_CHARS)
         if line != shown:
             tell(line)
@@ -241,7 +241,7 @@ def request_packages(
 def _name(name: str) -> str:
     """Check the server's name for the packages. Trust: only the server interprets the name."""
     if not 0 < len(name) <= _NAME_CHARS or not name.isalnum():
-        raise RemoteProtocolError("the server has packages of a name that is none")
+        raise RemoteProtocolError("the server gives the packages an invalid name")
     return name
 
 

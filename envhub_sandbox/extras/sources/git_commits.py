@@ -96,7 +96,7 @@ def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
     commit = next((found[name] for name in names if name in found), "")
     if not is_commit(commit):
         what = f"{url} has no tag or branch {revision!r}"
-        raise HubFailure(Kind.NO_REVISION, what, "Of a commit write all 40 digits")
+        raise HubFailure(Kind.NO_REVISION, what, "Write all 40 digits of a commit")
     return commit
 
 

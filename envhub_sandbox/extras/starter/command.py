@@ -140,7 +140,7 @@ def make_env(n_envs: int = 1, use_async_envs: bool = False) -> gym.vector.Vector
     return vector([one] * n_envs)
 '''),
     "requirements.txt": Template("""\
-# what env.py imports; wheels only. envhub makes an environment of its own of it where it is needed
+# The packages that env.py imports. envhub installs their wheels where this interpreter lacks them.
 gymnasium>=1.0
 numpy>=1.26
 """),

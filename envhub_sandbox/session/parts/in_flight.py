@@ -109,9 +109,9 @@ class InFlight:
         named: list[int] = ids.tolist()
         ordered = sorted(named)
         if ordered[0] < 0 or ordered[-1] >= count:
-            raise ActionError(f"env_ids holds {named}; there are 0 to {count - 1}")
+            raise ActionError(f"env_ids is {named}; the sub-environments are 0 to {count - 1}")
         if len(set(named)) < len(named):
-            raise ActionError(f"env_ids holds one twice: {named}")
+            raise ActionError(f"env_ids names a sub-environment twice: {named}")
         order = None if named == ordered else sorted(range(len(named)), key=named.__getitem__)
         return Rows(named, self._workers_of(ordered), order)
 

@@ -130,7 +130,7 @@ class SharedMemoryLane(SlabLane):
         self._sleepers = self.shards[self._awake :]
         self._wakers = self.shards[: self._awake]
         if not self._attach(dead, deadline):
-            raise RemoteProtocolError("a fresh runner refuses the fast lane that others take")
+            raise RemoteProtocolError("a new runner refuses the shared memory of the others")
 
     def _attach(self, shards: Sequence[int], deadline: Deadline) -> bool:
         """Have the runners of some shards serve their slabs; returns whether all do."""
@@ -382,7 +382,7 @@ class SharedMemoryLane(SlabLane):
             Lane.replies(self, Deadline(_CAUSE_S))
         except RunnersDiedError as error:
             return {dead[place]: death for place, death in error.deaths.items()}
-        raise RemoteProtocolError("the worker says that a process lives which has died")
+        raise RemoteProtocolError("the worker reports a dead process as alive")
 
     # --- the rest ------------------------------------------------------------------------------
 

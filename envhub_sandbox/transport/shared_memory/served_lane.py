@@ -84,7 +84,7 @@ class ServedLane(ColumnSteps):
         for index in dead:
             self.shards[index] = ServedShard(self.shards[index].layout, self.shards[index].observed)
         if not self._attach(dead, deadline, again=True):
-            raise RemoteProtocolError("a fresh runner refuses the slabs that others take")
+            raise RemoteProtocolError("a new runner refuses slabs, which the others use")
 
     def _attach(self, shards: Sequence[int], deadline: Deadline, *, again: bool = False) -> bool:
         """Have the server make slabs and the runners serve them; returns whether all do.

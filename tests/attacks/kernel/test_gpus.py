@@ -75,4 +75,4 @@ def test_a_jail_has_the_gpus_that_it_was_given(arena: Arena) -> None:
     assert "not counted: file locks, memory of the GPU's driver" in memory
     if "measured by" in memory:
         assert "memfds and shared memory that are mapped nowhere" in memory
-    assert f"GPU {gpu_host.MISSING}, and these are here: 0: /dev/nvidia0; 1:" in found["refused"]
+    assert f"GPU {gpu_host.MISSING}, which does not exist here; these do: 0:" in found["refused"]

@@ -108,8 +108,8 @@ def test_a_pin_that_is_there_asks_nobody(repository: Path, tmp_path: Path) -> No
     ("behind", "said"),
     [
         ("", "has no file 'env.py'. Name the entry file after a colon, as in ':envs/env.py'"),
-        ("@v9:envs/env.py", "no tag or branch 'v9'. Of a commit write all 40 digits"),
-        ("@0123456:envs/env.py", "write all 40 digits"),
+        ("@v9:envs/env.py", "no tag or branch 'v9'. Write all 40 digits of a commit"),
+        ("@0123456:envs/env.py", "Write all 40 digits"),
         (f"@{'1' * 40}:envs/env.py", "git fetch failed"),
     ],
 )

@@ -161,7 +161,7 @@ def test_what_cannot_be_meant_is_refused(gates: Gates) -> None:
     env = gates.env(3, num_workers=2)
     wrong = {
         "sub-environments 0 to 1 are stepped together, .* lacks 1": [0],
-        "there are 0 to 2": [0, 1, 3],
+        "sub-environments are 0 to 2": [0, 1, 3],
         "twice": [2, 2],
         r"it takes a list such as \[0, 3\]": [[0, 1]],
     }

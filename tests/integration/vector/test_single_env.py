@@ -418,7 +418,7 @@ def test_its_spec_makes_it_again(tmp_path: Path) -> None:
                 assert isinstance(again.unwrapped, ours), how
                 assert np.array_equal(np.ravel(again.reset(seed=4)[0]), first), how
                 assert again.spec.kwargs["policy"] == policy
-        with pytest.raises(ValueError, match="500 steps, and not of 9"):
+        with pytest.raises(ValueError, match="=9 is not the repository's limit, 500"):
             gym.make_vec(spec, max_episode_steps=9)
         with pytest.warns(UserWarning, match="takes no render_mode, so it is 'rgb_array'"):
             check_env(env)

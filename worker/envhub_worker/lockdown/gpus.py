@@ -59,8 +59,8 @@ def granted(gpu: bool | tuple[int, ...], host: HostFiles) -> GpuGrant:
         available = "; ".join(f"{index}: {' '.join(nodes)}" for index, nodes in enumerate(devices))
         raise LayerUnavailableError(
             "gpu",
-            f"the policy grants GPU {missing[0]}, and these are here: {available}",
-            "Name those.",
+            f"the policy grants GPU {missing[0]}, which does not exist here; these do: {available}",
+            "Grant some of these.",
         )
     return _granted([devices[index] for index in wanted], host)
 

@@ -57,10 +57,10 @@ def confinement_from_wire(data: dict[str, Any]) -> Confinement:
     """
     names = {item.name for item in fields(Confinement)}
     if set(data) != names:
-        raise RemoteProtocolError("a confinement has other fields")
+        raise RemoteProtocolError("the confinement lacks a field, or has an unknown one")
     readable = data["readable"]
     if type(readable) not in (list, tuple) or not all(type(path) is str for path in readable):
-        raise RemoteProtocolError("readable paths are a list of strings")
+        raise RemoteProtocolError("the readable paths are not a list of strings")
     checked = {"limits": _limits(data["limits"]), "gpu": _gpu(data["gpu"])}
     confinement = Confinement(**{**data, "readable": tuple(readable), **checked})
     if (
@@ -72,7 +72,7 @@ def confinement_from_wire(data: dict[str, Any]) -> Confinement:
         and _may_be_granted(confinement.environment)
     ):
         return confinement
-    raise RemoteProtocolError("a confinement that there cannot be")
+    raise RemoteProtocolError("a field of the confinement has an invalid value")
 
 
 def _gpu(value: Any) -> bool | tuple[int, ...]:
@@ -80,19 +80,19 @@ def _gpu(value: Any) -> bool | tuple[int, ...]:
         return value
     whole = type(value) in (list, tuple) and all(type(index) is int for index in value)
     if not whole or not 0 < len(value) <= _MAX_GPUS or min(value) < 0:
-        raise RemoteProtocolError("gpu is a boolean, or a list of indices")
+        raise RemoteProtocolError("gpu is neither a boolean nor a list of indices")
     return tuple(value)
 
 
 def _limits(data: Any) -> Limits:
     names = {item.name for item in fields(Limits)}
     if not isinstance(data, Mapping) or not set(data) <= names:
-        raise RemoteProtocolError("limits have other fields")
+        raise RemoteProtocolError("the limits have an unknown field")
     for name, value in data.items():
         highest = _MAX_OUTPUT_BYTES if name == "output_bytes" else _MAX_LIMIT
         lifted = value is None and name in _LIFTABLE
         if not lifted and not (type(value) is int and 1 <= value <= highest):
-            raise RemoteProtocolError(f"the limit {name} is a whole number from 1 to {highest}")
+            raise RemoteProtocolError(f"the limit {name} is not a whole number from 1 to {highest}")
     return Limits(**data)
 
 

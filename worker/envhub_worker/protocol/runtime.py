@@ -140,4 +140,4 @@ def _copy(value: Any) -> HubCopy:
 
 
 def _wrong() -> RemoteProtocolError:
-    return RemoteProtocolError("repositories of the Hub that there cannot be")
+    return RemoteProtocolError("the copies of Hub repositories are malformed")

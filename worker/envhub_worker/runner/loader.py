@@ -68,7 +68,7 @@ def _instance(names: Any, field_names: Any, values: dict[str, Any], computed: An
     for base in (next(filter(None, classes), None), None):
         with contextlib.suppress(Exception):  # of a kind that no dataclass can inherit from
             return _filled(_stand_in(names[0], base, field_names, computed), values)
-    raise TypeError(f"cfg: no {names[0][1]} can be made of {', '.join(values)}")
+    raise TypeError(f"cfg: {names[0][1]} cannot be made from {', '.join(values)}")
 
 
 def _filled(cls: type[Any], values: dict[str, Any]) -> Any:

@@ -364,7 +364,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         """Raise ``TypeError`` if ``VectorEnv._add_info`` cannot take an info."""
         empty = self._single and not info  # nothing is joined, and None says as much as {}
         if not empty and not hasattr(info, "items"):
-            raise TypeError("the info is no dict")
+            raise TypeError("the info is not a dict")
 
     def _refuse(
         self, error: Exception, index: int, method: str, result: Sequence[Any] = ()

@@ -197,7 +197,7 @@ class Server:
             return handler(self._jails, asker, request)
         if special := self._gate.handlers.get(type(request)):
             return special(asker, request, payload)
-        raise RefusedError("LocalProtocolError", f"{type(request).__name__} is no request")
+        raise RefusedError("LocalProtocolError", f"{type(request).__name__} is not a request")
 
     def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
         """Answer a request."""
@@ -222,7 +222,7 @@ class Server:
                 "the same release of envhub-sandbox on both sides",
             )
         if not request.session:
-            raise RefusedError("LocalProtocolError", "a session has a name")
+            raise RefusedError("LocalProtocolError", "Hello has no name of a session")
         self._gate.greet(arrived, request.session)
         return m.Welcome(m.VERSION, __version__, os.getpid())
 

@@ -155,7 +155,7 @@ class Jails:
         entry = self._owned(asker, request.jail)
         self._check_runners(request.runners, len(entry.links))
         if len(entry.lost) > MAX_LOST:
-            raise RefusedError("WorkerError", f"{len(entry.lost)} of its runners have died")
+            raise RefusedError("WorkerError", f"{len(entry.lost)} runners of this jail have died")
         self._start_runners(asker, entry, request.runners)
 
     def _check_zygotes(self, asker: Asker, zygote: _Zygote) -> None:
@@ -163,9 +163,9 @@ class Jails:
         if not self._local and zygote not in held and len(held) >= MAX_REMOTE_ZYGOTES:
             raise RefusedError(
                 "WorkerError",
-                f"your key has jails of {len(held)} kinds, by their packages, policies and "
-                "variables that are read at a start, which is as many as a server starts "
-                "interpreters for: close environments of some kind, or give them the same",
+                f"your key has jails of {len(held)} kinds, which is the most. Jails of one kind "
+                "have the same packages, policy, and variables that Python reads when it starts: "
+                "close environments, or give more of them the same",
             )
 
     def _check_runners(self, more: int, present: int) -> None:
@@ -244,7 +244,7 @@ class Jails:
         pending: set[int] = set()
         for part in request.slabs:
             if type(part) is not tuple or list(map(type, part)) != [int] * 4:
-                raise RefusedError("LocalProtocolError", "slabs are four whole numbers each")
+                raise RefusedError("LocalProtocolError", "slabs are not four whole numbers")
             runner, leaves, request_bytes, observation_bytes = part
             if runner in entry.lost:
                 continue  # the request that follows is answered with its death
@@ -254,11 +254,11 @@ class Jails:
             if owes(entry, runner):
                 raise RefusedError("LocalProtocolError", f"runner {runner} owes an answer")
             if not words.served(leaves, request_bytes, observation_bytes, most):
-                raise RefusedError("WorkerError", f"no slabs are made as in {part}")
+                raise RefusedError("WorkerError", f"the sizes of slabs are out of range: {part}")
             # The kernel charges a page to the process that touches it first. For these slabs that
             # is the server, so the jail's own limits do not bound them.
             if entry.shared_bytes({runner}) + request_bytes + observation_bytes > room:
-                raise RefusedError("WorkerError", "its slabs would be more than memory_bytes")
+                raise RefusedError("WorkerError", "slabs would be larger than memory_bytes")
             slabs = ServedSlabs(leaves, request_bytes, observation_bytes)
             self._events.share(entry.links[runner], slabs)
             deposit, slabs.deposit = slabs.deposit, []

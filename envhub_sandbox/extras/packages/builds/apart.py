@@ -56,7 +56,7 @@ def _asked(order: dict[str, Any], title: str) -> str:
             )
         except subprocess.TimeoutExpired:
             raise DependencyError(
-                f"{title} was not fetched and read within {DEADLINE_S:.0f} s, and is not taken",
+                f"{title} was not fetched and read within {DEADLINE_S:.0f} s, so it is not used",
                 reason="integrity",
             ) from None
     try:

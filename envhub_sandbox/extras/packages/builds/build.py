@@ -236,7 +236,7 @@ class _Build:
                 apart.check_wheel(result, source.name, source.version, interpreter)
                 return wheels.keep(result, self._source, lock, self._interpreter)
             known = (*known, *result)
-        raise BuildFailedError("its backend never has all that it needs")
+        raise BuildFailedError("its build backend always asks for further packages")
 
     def _environment(self, further: Iterable[str]) -> tuple[Path, str]:
         """Returns the folder of the build requirements, and the hash of their lock."""

@@ -30,7 +30,7 @@ def read(tree: Path, title: str) -> Project:
     where = f"[build-system] of {title}"
     build_system = pyproject(tree, where).get("build-system", {})
     if not isinstance(build_system, dict):
-        raise DependencyError(f"{where} is no table", reason="requirement")
+        raise DependencyError(f"{where} is not a table", reason="requirement")
     requires = _texts(build_system.get("requires", list(_LEGACY)), where)
     backend = build_system.get("build-backend", _LEGACY_BACKEND)
     paths = _texts(build_system.get("backend-path", []), where)
@@ -45,9 +45,9 @@ def read(tree: Path, title: str) -> Project:
 
 def _texts(found: object, where: str) -> tuple[str, ...]:
     if not isinstance(found, list) or len(found) > _MOST:
-        raise DependencyError(f"{where} has no list of at most {_MOST} texts", reason="requirement")
+        raise DependencyError(f"{where} must list at most {_MOST} strings", reason="requirement")
     if not all(isinstance(item, str) and item.isprintable() for item in found):
-        raise DependencyError(f"{where} holds something else than texts", reason="requirement")
+        raise DependencyError(f"{where} has an entry that is not a string", reason="requirement")
     return tuple(found)
 
 

@@ -82,7 +82,7 @@ def write_tree(members: Iterable[Member], folder: Path, title: str) -> None:
 def _write(member: Member, path: Path, title: str) -> None:
     with member.open() as source, path.open("xb") as target:
         if copy_bounded(source, target, member.size) != member.size:
-            raise not_as_expected(f"{title}: {member.path!r} has not the size that it says")
+            raise not_as_expected(f"{title}: {member.path!r} has another size than its header says")
     path.chmod(0o755 if member.executable else 0o644)
 
 
@@ -247,7 +247,7 @@ def _size_of(header: tarfile.TarInfo, said: dict[str, str], title: str) -> int:
     """Returns the size of a header's data; a preceding extended header overrides a file's size."""
     size = said.get("size", "") if header.type in _REGULAR else ""
     if header.size < 0 or not re.fullmatch(r"[0-9]{0,20}", size):
-        raise not_as_expected(f"{title} holds {header.name[:200]!r}, of which the size is none")
+        raise not_as_expected(f"{title} holds {header.name[:200]!r}, whose size is invalid")
     return int(size or header.size)
 
 
@@ -268,7 +268,7 @@ def _said(kind: bytes, data: bytes, title: str) -> dict[str, str]:
             said[name] = data[record.end() : end - 1].decode("utf-8", "surrogateescape")
         at = end
     if data[at:].strip(b"\0"):
-        raise not_as_expected(f"{title} cannot be unpacked: a header of it is none")
+        raise not_as_expected(f"{title} cannot be unpacked: it has a malformed header")
     return said
 
 
@@ -281,7 +281,7 @@ def check_zip(members: Sequence[zipfile.ZipInfo], title: str) -> None:
             raise _no_file(title, member.filename)
         if member.compress_type not in _PACKINGS:
             raise not_as_expected(
-                f"{title} holds {member.filename[:200]!r}, packed in another way, which is not read"
+                f"{title} holds {member.filename[:200]!r}, packed by a method that is not supported"
             )
         if member.header_offset < end:
             raise not_as_expected(

@@ -102,7 +102,7 @@ def named(file: str, name: str, version: str) -> Version:
         distribution, number, _, _ = parse_wheel_filename(file)
         wanted = Version(version) if version else number
     except (InvalidWheelFilename, InvalidVersion) as error:
-        raise not_as_expected(f"its name says nothing: {error}") from error
+        raise not_as_expected(f"its file name is invalid: {error}") from error
     if distribution != canonicalize_name(name) or number != wanted:
         raise not_as_expected(f"it is {distribution} {number}, and not {name} {wanted}")
     return number

@@ -202,8 +202,8 @@ class _Reader:
 
     def _wrong(self, name: str) -> LockError:
         return LockError(
-            f"{name} in [tool.envhub] of {self._where} is missing, or nothing that 'envhub lock' "
-            "writes"
+            f"{name} in [tool.envhub] of {self._where} is missing, or is not as 'envhub lock' "
+            "writes it"
         )
 
     def _files(self) -> dict[str, str]:

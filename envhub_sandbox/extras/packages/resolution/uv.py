@@ -159,7 +159,7 @@ def run(
                     process.stderr = None  # closing it would wait for the listener
         if sys.platform != "win32" and process.returncode == -signal.SIGXFSZ:
             raise DependencyError(
-                f"{what}: a file was about to have more than {file_bytes} bytes", reason="size"
+                f"{what}: a file would have become larger than {file_bytes} bytes", reason="size"
             )
         if process.returncode != 0:
             raise _error(what, "\n".join(lines))

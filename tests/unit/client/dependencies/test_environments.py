@@ -278,7 +278,7 @@ def test_a_full_disk_is_said(index: Index, tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("files", "said"),
     [
-        ({"wanted/one.bin": b"0" * 2**21}, "a file was about to have more than 1048576 bytes"),
+        ({"wanted/one.bin": b"0" * 2**21}, "a file would have become larger than 1048576 bytes"),
         ({f"wanted/{n}.bin": b"0" * 2**18 for n in range(6)}, "at most 1 MiB are installed"),
         ({f"wanted/{n}.py": "" for n in range(100)}, "at most 60 are installed"),
     ],

@@ -20,7 +20,7 @@ from envhub_worker.protocol.keys import key_text
 def test_a_fleet_is_no_place_of_another() -> None:
     for nested in (Fleet(["tcp://a:1"]), "tcp://a:1,tcp://b:1", ["tcp://a:1"]):
         places: Any = [nested]
-        with pytest.raises(errors.PolicyError, match="no fleet"):
+        with pytest.raises(errors.PolicyError, match="cannot be a place of a fleet"):
             Fleet(places).opened(sandbox_of)
 
 

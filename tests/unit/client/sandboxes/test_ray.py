@@ -37,7 +37,7 @@ from tests.support.processes import eventually
 def test_an_answer_that_is_none_is_refused(lie: Any) -> None:
     """Whatever Ray has made of it; nothing but JSON in bytes is read, and no subclass of these."""
     assert cluster.read_answer(b'{"code": 3}') == {"code": 3}
-    with pytest.raises(WorkerStartupError, match="none of ours"):
+    with pytest.raises(WorkerStartupError, match="of another program"):
         cluster.read_answer(lie)
 
 
@@ -47,8 +47,8 @@ def test_an_answer_that_is_none_is_refused(lie: Any) -> None:
         (b'{"code": 3, "log": "no\\nroom"}', "it ended with 3: no room"),
         (b'{"code": "\\u001b[2J", "log": "\\u001b[2J"}', r"it ended with \x1b[2J: \x1b[2J"),
         (b'{"code": "%s", "log": ""}' % (b"x" * 60_000), "it ended with xxx"),
-        (b"nonsense", "none of ours"),
-        (7, "none of ours"),
+        (b"nonsense", "of another program"),
+        (7, "of another program"),
     ],
 )
 def test_how_servers_ended_is_text(answer: Any, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,7 +210,7 @@ def test_a_lie_of_a_node_is_refused(lie: dict[str, Any]) -> None:
     assert sandbox.read_started(GOOD) == (GOOD["endpoint"], b"\xab" * 32, GOOD["node"], (1, 0))
     on_six = GOOD | {"endpoint": "tcp://[fd00::3]:4711"}
     assert sandbox.read_started(on_six)[0] == "tcp://[fd00::3]:4711"
-    with pytest.raises(WorkerStartupError, match="no server"):
+    with pytest.raises(WorkerStartupError, match="not started a worker server"):
         sandbox.read_started(GOOD | lie)
     with pytest.raises(WorkerStartupError):
         sandbox.read_started({name: GOOD[name] for name in GOOD if name not in lie})

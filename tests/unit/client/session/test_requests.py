@@ -66,7 +66,7 @@ def test_a_wrong_message_gives_the_worker_up(session: EnvSession, lane: FakeLane
     for lane.answer in (m.Value(1), m.Method()):
         assert session.requests.ask_own("name", m.GetOwn, "name") == lane.answer
     lane.answer = m.ResetDone(0, {})
-    with pytest.raises(errors.RemoteProtocolError, match="ResetDone where Value or Method belongs"):
+    with pytest.raises(errors.RemoteProtocolError, match="ResetDone instead of Value or Method"):
         session.requests.ask_own("name", m.GetOwn, "name")
     assert session.lifecycle.state is State.DEAD
     with pytest.raises(errors.WorkerDiedError, match="cannot render"):

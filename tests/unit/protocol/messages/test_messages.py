@@ -134,7 +134,7 @@ def test_the_id_of_a_header_that_cannot_be_read_is_known() -> None:
 def test_an_impossible_id_is_refused(start: bytes) -> None:
     frame = start + bytes(m.pack(m.Done())[0]) if len(start) == 8 else start
     assert m.id_of(frame) is None
-    with pytest.raises(RemoteProtocolError, match="starts with the id"):
+    with pytest.raises(RemoteProtocolError, match="not start with the id"):
         m.unpack_header(frame)
 
 
@@ -147,9 +147,9 @@ def test_a_header_is_never_taken_for_packed(number: int) -> None:
 @pytest.mark.parametrize(
     ("value", "complaint"),
     [
-        ({}, "is a list"),
-        ([], "is a list"),
-        ((11,), "is a list"),
+        ({}, "is not a list"),
+        ([], "is not a list"),
+        ((11,), "is not a list"),
         ([999], "unknown message kind"),
         ([True], "unknown message kind"),
         ([11.0], "unknown message kind"),

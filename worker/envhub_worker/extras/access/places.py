@@ -272,5 +272,5 @@ class Drain:
         if self._until is not None:
             raise BusyError(
                 Busy(DRAINING, 0, 0, RETRY_S),
-                "the server drains and accepts nothing new: try again when its replacement runs",
+                "the server is ending and takes no new work: try again when its replacement runs",
             )

@@ -155,7 +155,7 @@ class RemoteGate(Gate):
         try:
             confinement = confinement_from_wire(request.confinement)
         except ProtocolError as error:
-            raise RefusedError("LocalProtocolError", f"no confinement: {error}") from None
+            raise RefusedError("LocalProtocolError", f"malformed confinement: {error}") from None
         check_policy(request, confinement, self._rules.permissions)
         wrong = wrong_with_path(request.entry)
         if wrong:
@@ -199,7 +199,7 @@ class RemoteGate(Gate):
 
     def _put(self, asker: Asker, request: m.PutBlob, payload: Payload) -> m.Message:
         if len(payload) != 1:
-            raise RefusedError("LocalProtocolError", "PutBlob has one frame")
+            raise RefusedError("LocalProtocolError", "PutBlob does not have exactly one frame")
         self._uploads.put(asker.session, asker.key, request, payload[0])
         return m.Done()
 

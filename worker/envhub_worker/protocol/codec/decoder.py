@@ -115,7 +115,7 @@ class Decoder:
             # msgpack and numpy raise many types, and comparing hostile keys may raise any other.
             raise RemoteProtocolError(f"The header cannot be decoded: {error}") from error
         if self._heads:
-            raise RemoteProtocolError("An extension that heads an array stands elsewhere.")
+            raise RemoteProtocolError("An extension is not the first element of its array.")
         if self._arrays is not None:
             self._arrays.finish()
         elif self._tail or self._buffers:
@@ -170,7 +170,7 @@ class Decoder:
     def make(self, head: _Head, items: list[Any]) -> object:
         """Makes a described object. All descriptions of one message share a budget."""
         if self.things is None or len(items) != 1:
-            raise RemoteProtocolError("The message describes what is not made here.")
+            raise RemoteProtocolError("The message describes an object of a kind not made here.")
         if self._make is None:
             self._make = self.things(self.limits)
         return self._make(head.code, _owned(items[0]) if self._borrows else items[0])
@@ -181,7 +181,7 @@ class Decoder:
         self._hashed_keys += len(hashed)
         if self._hashed_keys > self.limits.hashed_keys:
             raise MessageTooLargeError(
-                f"More than {self.limits.hashed_keys} keys that are no text (hashed_keys)."
+                f"More than {self.limits.hashed_keys} keys that are not text (hashed_keys)."
             )
         # A description hashes its texts, which Python randomises; equal descriptions cost nothing.
         chosen = [hash(key) for key in hashed if key.__class__ not in _DESCRIBED]

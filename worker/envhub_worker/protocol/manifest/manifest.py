@@ -150,7 +150,7 @@ def decode_manifest(
         fields = _mapping(value, _FIELDS, "a manifest")
         envs = fields["envs"]
         if type(envs) is not tuple or not 1 <= len(envs) <= MAX_ENVS:
-            raise RemoteProtocolError(f"a manifest holds 1 to {MAX_ENVS} environments")
+            raise RemoteProtocolError(f"a manifest does not hold 1 to {MAX_ENVS} environments")
         reader = SpaceReader(max_elements, check, generator)
         decoded = tuple(_decode_env(env, reader) for env in envs)
         if len({(env.suite, env.task) for env in decoded}) != len(decoded):
@@ -199,7 +199,7 @@ def _decode_env(value: object, reader: SpaceReader) -> EnvManifest:
 
 def _mapping(value: object, names: frozenset[str], name: str) -> Mapping[str, Any]:
     if type(value) is not dict or value.keys() != names:
-        raise RemoteProtocolError(f"{name} has the fields {', '.join(sorted(names))}")
+        raise RemoteProtocolError(f"{name} has other fields than {', '.join(sorted(names))}")
     return value
 
 

@@ -64,7 +64,7 @@ def unpack_frames(frames: Sequence[Buffer], limits: WireLimits) -> list[Buffer]:
         return list(frames)
     header = m.unpack([m.without_id(frames[0])], limits=limits)
     if not isinstance(header, m.CompressionHeader):
-        raise RemoteProtocolError("the id 0 stands before CompressionHeader alone")
+        raise RemoteProtocolError("the id 0 is not followed by a CompressionHeader")
     bodies = list(frames[1:])
     _check(header, bodies, limits)
     block = _lz4() if header.compression == "lz4" else None
@@ -81,7 +81,7 @@ def _check(header: m.CompressionHeader, bodies: Sequence[Buffer], limits: WireLi
     if len(header.sizes) != len(bodies):
         raise RemoteProtocolError("CompressionHeader does not fit its frames")
     if any(type(size) is not int or size < -1 for size in header.sizes):
-        raise RemoteProtocolError("CompressionHeader has a size that is none")
+        raise RemoteProtocolError("CompressionHeader has an invalid size")
     total = sum(_size(b) if s == -1 else s for b, s in zip(bodies, header.sizes, strict=True))
     if max(header.sizes, default=0) > limits.frame_bytes or total > limits.message_bytes:
         raise MessageTooLargeError(f"{total} bytes when unpacked are over the limit.")
@@ -93,7 +93,7 @@ def _unpacked(body: Buffer, size: int, block: Any) -> bytes:
     except Exception as error:  # lz4 has errors of its own
         raise RemoteProtocolError(f"a frame cannot be unpacked: {error}") from None
     if len(content) != size:
-        raise RemoteProtocolError("a frame is not as large as it says")
+        raise RemoteProtocolError("an unpacked frame has another size than CompressionHeader says")
     return content
 
 

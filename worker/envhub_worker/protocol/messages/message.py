@@ -229,7 +229,7 @@ def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> tupl
     """
     number = id_of(frame)
     if number is None:
-        raise RemoteProtocolError("a header starts with the id of its request")
+        raise RemoteProtocolError("the header does not start with the id of a request")
     header = without_id(frame)
     form = _INCOMING.get(header) if type(header) is bytes else None
     if form is not None and form.limits is limits:  # as unpack, which a step need not call
@@ -255,7 +255,7 @@ def number_of(frame: Buffer) -> int | None:
 
 def _checked(value: object) -> Message:
     if type(value) is not list or not value:
-        raise RemoteProtocolError("a message is a list that starts with its kind")
+        raise RemoteProtocolError("the message is not a list that starts with its kind")
     kind, *fields = value
     cls = KINDS.get(kind) if type(kind) is int else None
     if cls is None:

@@ -91,7 +91,7 @@ class Prefix(Generic[T]):
         message = unpack([frame])
         things = values_of(message)[0] if type(message) is self._kind else None
         if type(things) is not tuple or len(things) > self.most:
-            raise RemoteProtocolError(f"the worker says {name} in another way than was agreed on")
+            raise RemoteProtocolError(f"the worker sent {name} in another form than was agreed on")
         return things
 
 
@@ -102,13 +102,13 @@ def _warning(value: object) -> RemoteWarning:
     if len(category) > MAX_CATEGORY or len(text) > MAX_TEXT:
         raise RemoteProtocolError("a warning of the worker is too long")
     if category == SHARED_CATEGORY and text not in SHARED_STATE:
-        raise RemoteProtocolError("the worker says that nothing known is shared")
+        raise RemoteProtocolError("the worker reports shared state of an unknown kind")
     return category, text
 
 
 def _attribute(value: object) -> Attribute:
     if type(value) is not tuple or list(map(type, value)) != [int, str]:
-        raise RemoteProtocolError("the worker reports a change of something that is no attribute")
+        raise RemoteProtocolError("the worker reports a change of what is not an attribute")
     number, name = value
     return number, name
 

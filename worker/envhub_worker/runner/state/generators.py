@@ -23,8 +23,8 @@ class Generators:
     def _state(self, index: int, generator: Any) -> dict[str, Any]:
         if not isinstance(generator, np.random.Generator):
             raise TypeError(
-                f"np_random is a {type(generator).__name__} here, and no numpy Generator: draw "
-                "from it in the environment alone"
+                f"np_random is a {type(generator).__name__} here, not a numpy Generator: draw "
+                "from it in the environment only"
             )
         number, last = self._last.get(index, (0, None))
         if generator is not last:  # kept, so that no other one gets its id

@@ -147,7 +147,7 @@ class Uploads:
     def put(self, owner: bytes, key: bytes, request: m.PutBlob, data: bytes) -> None:
         """Take a piece of a wanted file; the last one makes it a blob. Raises ``RefusedError``."""
         if len(request.sha256) != _SHA256_BYTES:  # it would be a file's name
-            raise RefusedError("LocalProtocolError", "a hash has 32 bytes")
+            raise RefusedError("LocalProtocolError", "a hash does not have 32 bytes")
         offer = self._offers.get(owner)
         size = None if offer is None else offer.missing.get(request.sha256)
         if offer is None or size is None:
@@ -173,7 +173,7 @@ class Uploads:
         if partial is None or request.offset == 0:
             mine = sum(bringer == owner for bringer, _ in self._partial)
             if partial is None and mine >= MAX_PARTIAL:
-                raise RefusedError("WorkerError", f"{MAX_PARTIAL} files are on their way already")
+                raise RefusedError("WorkerError", f"{MAX_PARTIAL} files are being uploaded already")
             make_passable(home)
             (home / "parts").mkdir(mode=0o700, exist_ok=True)
             name = hashlib.sha256(owner + request.sha256).hexdigest()
@@ -242,8 +242,8 @@ class Uploads:
                 "WorkerError",
                 "your key's snapshots would take more than the server's quota of "
                 f"{size_text(self._quotas.upload_bytes)} (--max-upload), or be more than "
-                f"{MAX_TREES}; open environments use the others, or other processes of yours bring "
-                "them",
+                f"{MAX_TREES}; the others are used by open environments, or uploaded by other "
+                "processes of yours",
             )
 
     def _remove_unused(self, store: BlobStore, in_use: Collection[str]) -> None:
@@ -284,7 +284,7 @@ def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[ListedFil
     steps = sum(file.path.count("/") + 1 for file in listed)
     if steps > MAX_STEPS:
         raise RefusedError(
-            "WorkerError", f"the paths of a snapshot have {steps} steps, over {MAX_STEPS}"
+            "WorkerError", f"a snapshot has {steps} parts of paths, over {MAX_STEPS}"
         )
     _check_tree([file.path for file in listed])
     return listed
