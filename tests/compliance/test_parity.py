@@ -1,14 +1,18 @@
 """The samples that have a ``SyncVectorEnv`` to be compared with, against the suite."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from gymnasium.error import CustomSpaceError
 from gymnasium.vector import AutoresetMode
 
+from envhub_sandbox import make_env
 from tests.compliance.pair import Pair
 from tests.compliance.vector_env import Case, VectorEnvCompliance, cases, each_mode
 from tests.support import inside
 from tests.support.compare import assert_same
+from tests.support.repositories import STILL, write_repository
 
 
 class TestCounter(VectorEnvCompliance):
@@ -183,3 +187,22 @@ class TestMultiObjective(VectorEnvCompliance):
     sample = "mo_gymnasium"
     cases = [Case(3)]  # noqa: RUF012
     steps = 60
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_a_space_of_another_byte_order_has_the_same_values(lane: str, tmp_path: Path) -> None:
+    """They arrive in native byte order, as the space does."""
+    foreign = """
+class Foreign(Still):
+    observation_space = gym.spaces.Box(-9, 9, (2,), np.dtype(">f4"))
+
+    def reset(self, **options):
+        return np.array([1, 2], ">f4"), {}
+
+    def step(self, action):
+        return np.array([3, 4]), 0.0, False, False, {}
+"""
+    folder = write_repository(tmp_path, STILL + foreign)
+    with make_env(folder, 2, policy={"lane": lane}) as suites:
+        assert_same(np.array([[1, 2]] * 2, np.float32), suites.env.reset()[0])
+        assert_same(np.array([[3, 4]] * 2, np.float32), suites.env.step([0, 1])[0])

@@ -75,7 +75,7 @@ def test_batches_are_lent_where_they_lie() -> None:
 
 def test_what_has_no_elements_is_lent_like_the_rest(tmp_path: Path) -> None:
     empty = """
-class Empty(gym.Wrapper):
+class Empty(Still):
     observation_space = gym.spaces.Box(-1, 1, (0, 2))
 
     def reset(self, **options):
@@ -83,9 +83,6 @@ class Empty(gym.Wrapper):
 
     def step(self, action):
         return np.zeros((0, 2)), 0.0, False, False, {}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return vector(lambda: Empty(Still()), n_envs)
 """
     with make_env(write_repository(tmp_path, STILL + empty), n_envs=2, copy=False) as suites:
         env = suites.env

@@ -189,7 +189,8 @@ def _paged(size: int) -> int:
 
 def _leaves(space: gym.Space[Any], path: tuple[Any, ...] = ()) -> Iterator[Any]:
     if isinstance(space, ARRAY_SPACES):
-        yield path, np.dtype(space.dtype), tuple(space.shape or ())
+        # in native byte order, in which the client has the space
+        yield path, np.dtype(np.dtype(space.dtype).type), tuple(space.shape or ())
     elif isinstance(space, spaces.Dict):
         for key, sub in space.spaces.items():
             yield from _leaves(sub, (*path, key))
