@@ -145,8 +145,8 @@ def _whole(messages: Sequence[Any], bounds: Sequence[tuple[int, int]]) -> m.Mess
     for name in _SLICED.get(type(first), ()):
         changes[name] = _joined([getattr(message, name) for message in messages])
     if isinstance(first, (m.GetOne, m.CallOne)):
-        asked = zip(bounds, messages, strict=True)
-        rows = [start + part.index for (start, _), part in asked if part.index is not None]
+        pairs = zip(bounds, messages, strict=True)
+        rows = [start + part.index for (start, _), part in pairs if part.index is not None]
         changes["index"] = rows[0] if rows else None
     whole: m.Message = m.replace(first, **changes)
     return whole

@@ -54,11 +54,11 @@ class Fleet(Sandbox):
             raise PolicyError(
                 f"a fleet's places are {self.places!r}; they are a list, or text with commas"
             )
-        known = {option.name for option in fields(RemoteSandbox) if option.init} - {"endpoint"}
-        if unknown := sorted(map(repr, set(self.remote) - known)):
+        permitted = {option.name for option in fields(RemoteSandbox) if option.init} - {"endpoint"}
+        if unknown := sorted(map(repr, set(self.remote) - permitted)):
             raise PolicyError(
                 f"a fleet's remote has {', '.join(unknown)}; RemoteSandbox takes "
-                f"{', '.join(sorted(known))}"
+                f"{', '.join(sorted(permitted))}"
             )
 
     def __getstate__(self) -> dict[str, Any]:

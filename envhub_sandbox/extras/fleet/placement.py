@@ -71,9 +71,9 @@ class Rooms:
             now = monotonic()
             stale = [server for server in servers if self._is_stale(server, now)]
             calls = [partial(remote.ask_facts, servers[server]) for server in stale]
-            asked = Calls(calls)
-            asked.wait(_WAIT_S)
-            self._pending.update({one: (now, p) for one, p in zip(stale, asked.each, strict=True)})
+            polls = Calls(calls)
+            polls.wait(_WAIT_S)
+            self._pending.update({one: (now, p) for one, p in zip(stale, polls.each, strict=True)})
             return {server: self._room(server) for server in servers}
 
     def _is_stale(self, member: Member, now: float) -> bool:

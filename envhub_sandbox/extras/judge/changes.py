@@ -115,8 +115,8 @@ def _changed_lines(then: Path, now: Path) -> tuple[str, ...]:
     )
     start = max(0, same - _AROUND)
     old, new = (lines[start : start + _COMPARED] for lines in (before, after))
-    found = difflib.unified_diff(old, new, lineterm="", n=_AROUND)
-    lines = [printable(line, _WIDEST) for line in itertools.islice(found, 2, _MOST_LINES + 3)]
+    diff = difflib.unified_diff(old, new, lineterm="", n=_AROUND)
+    lines = [printable(line, _WIDEST) for line in itertools.islice(diff, 2, _MOST_LINES + 3)]
     longest = max(path.stat().st_size for path in (then, now))
     is_long = longest > _MOST_BYTES or max(len(before), len(after)) > start + _COMPARED
     if is_long or len(lines) > _MOST_LINES:
@@ -157,10 +157,10 @@ def _value(what: str, then: str, now: str) -> Iterator[Change]:
 
 
 def _packages(read: Static) -> dict[str, str]:
-    found: dict[str, list[str]] = {}
+    by_package: dict[str, list[str]] = {}
     for package in read.declared.wanted if read.declared else ():
-        found.setdefault(package.requirement.name.lower(), []).append(str(package))
-    return {name: ", ".join(sorted(texts)) for name, texts in found.items()}
+        by_package.setdefault(package.requirement.name.lower(), []).append(str(package))
+    return {name: ", ".join(sorted(texts)) for name, texts in by_package.items()}
 
 
 def _imports(read: Static) -> dict[str, str]:

@@ -153,36 +153,36 @@ _LARGEST = 1e100
 
 def bar_plot(name: str, values: Sequence[float]) -> str:
     """Draws one bar per finite number, from zero; averages neighbours if there are too many."""
-    known = finite(values)
-    if not len(known):
+    numbers = finite(values)
+    if not len(numbers):
         return ""
-    each = -(-len(known) // _MOST_BARS)
-    groups = [known[at : at + each] for at in range(0, len(known), each)]
+    each = -(-len(numbers) // _MOST_BARS)
+    groups = [numbers[at : at + each] for at in range(0, len(numbers), each)]
     heights = [float(np.mean(group)) for group in groups]
     low, high = _range([0.0, *heights])
     wide = min((_WIDTH - _LEFT - _RIGHT) / len(heights), _WIDEST)
     shown = []
     for index, value in enumerate(heights):
         top, base = sorted((_y(value, low, high), _y(0.0, low, high)))
-        first, last = index * each + 1, min((index + 1) * each, len(known))
-        which = f"{first}" if each == 1 else f"mean of {first} to {last}"
+        first, last = index * each + 1, min((index + 1) * each, len(numbers))
+        caption = f"{first}" if each == 1 else f"mean of {first} to {last}"
         box = (_LEFT + (index + 0.1) * wide, top, max(0.8 * wide, 0.5), max(base - top, 1.0))
-        shown.append(_bar(box, f"{which}: {number(value)}"))
+        shown.append(_bar(box, f"{caption}: {number(value)}"))
     marks = [*_level(high, low, high), *_level(low, low, high)]
-    foot = f"{len(known)}" if each == 1 else f"{len(known)}, mean of {each} each"
-    feet = [(0.5, "1"), (len(heights) - 0.5, foot)] if len(known) > 1 else []
+    foot = f"{len(numbers)}" if each == 1 else f"{len(numbers)}, mean of {each} each"
+    feet = [(0.5, "1"), (len(heights) - 0.5, foot)] if len(numbers) > 1 else []
     ends = [(at * wide / (_WIDTH - _LEFT - _RIGHT), word) for at, word in feet]
     return _svg(name, [*shown, *marks, *_below(ends)])
 
 
 def histogram_plot(name: str, seconds: Sequence[float]) -> str:
     """Draws the distribution of durations in logarithmic bins, with median and 99th percentile."""
-    known = np.maximum(finite(seconds), 1e-7)
-    if not len(known):
+    numbers = np.maximum(finite(seconds), 1e-7)
+    if not len(numbers):
         return ""
-    bins = min(_BINS, max(3, len(known) // 2))  # few values need wide bins
-    edges = np.geomspace(known.min() / 1.05, known.max() * 1.05, bins + 1)
-    counts, _ = np.histogram(known, edges)
+    bins = min(_BINS, max(3, len(numbers) // 2))  # few values need wide bins
+    edges = np.geomspace(numbers.min() / 1.05, numbers.max() * 1.05, bins + 1)
+    counts, _ = np.histogram(numbers, edges)
     wide, most = (_WIDTH - _LEFT - _RIGHT) / bins, float(counts.max())
     shown = []
     for index, count in enumerate(counts.tolist()):
@@ -193,7 +193,7 @@ def histogram_plot(name: str, seconds: Sequence[float]) -> str:
             shown.append(_bar(box, f"{span}: {count}"))
     length = math.log(edges[-1] / edges[0])
     for share, word in ((0.5, "median"), (0.99, "99 %")):
-        value = float(np.quantile(known, share))
+        value = float(np.quantile(numbers, share))
         at = _x(math.log(value / edges[0]) / length)
         anchor = "end" if at > _WIDTH / 2 else "start"
         aside = -4 if anchor == "end" else 4
@@ -205,12 +205,12 @@ def histogram_plot(name: str, seconds: Sequence[float]) -> str:
 
 def line_plot(name: str, values: Sequence[float], parts: Sequence[tuple[int, str]]) -> str:
     """Draws numbers of bytes as a line; ``parts``: number of values and label of each part."""
-    known = finite(values)
-    if len(known) < 2 or len(known) != len(values):
+    numbers = finite(values)
+    if len(numbers) < 2 or len(numbers) != len(values):
         return ""
-    low, high = _range([0.0, *known.tolist()])  # from zero: small changes look small
-    last = len(known) - 1
-    points = [(_x(at / last), _y(value, low, high)) for at, value in enumerate(known.tolist())]
+    low, high = _range([0.0, *numbers.tolist()])  # from zero: small changes look small
+    last = len(numbers) - 1
+    points = [(_x(at / last), _y(value, low, high)) for at, value in enumerate(numbers.tolist())]
     path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
     base = f"{_HEIGHT - _BOTTOM:.1f}"
     area = f"{points[0][0]:.1f},{base} {path} {points[-1][0]:.1f},{base}"
@@ -226,7 +226,7 @@ def line_plot(name: str, values: Sequence[float], parts: Sequence[tuple[int, str
             ends.append((share, word))
             if share < 1:
                 shown.append(_line(_x(share), _TOP, _x(share), _HEIGHT - _BOTTOM, "mark"))
-    highest = size_text(float(known.max()))
+    highest = size_text(float(numbers.max()))
     shown.append(_word(_LEFT, _TOP - 5, f"up to {highest}", "start"))
     return _svg(name, [*shown, *_below(ends)])
 

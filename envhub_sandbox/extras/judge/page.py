@@ -114,8 +114,8 @@ def _pictures(film: Film) -> Iterator[str]:
         yield f'<img alt="{alt}" src="{data("image/png", still)}">'
     yield "</div></div>"
     if film.lacks:
-        what = "The film ends early" if film.video else "No film" if film.stills else "No picture"
-        yield f'<p class="dim">{what}: {text(film.lacks)}</p>'
+        title = "The film ends early" if film.video else "No film" if film.stills else "No picture"
+        yield f'<p class="dim">{title}: {text(film.lacks)}</p>'
 
 
 def _plots(play: Play) -> Iterator[str]:
@@ -147,8 +147,8 @@ def _plot(name: str, figure: str, svg: str) -> str:
 
 
 def _mean(values: Sequence[float]) -> str:
-    known = finite(values)
-    return f"mean {number(float(np.mean(known)))}" if len(known) else ""
+    numbers = finite(values)
+    return f"mean {number(float(np.mean(numbers)))}" if len(numbers) else ""
 
 
 def _median(seconds: Sequence[float]) -> str:
@@ -185,8 +185,8 @@ def _held(report: Report) -> Iterator[str]:
         for check, of in tasks.items()
     ]
     yield "<h2>Checks that hold</h2>"
-    what = counted(len(rows), "check holds", "checks hold")
-    yield from folded(what, table(("check", "what holds", "tasks"), rows))
+    title = counted(len(rows), "check holds", "checks hold")
+    yield from folded(title, table(("check", "what holds", "tasks"), rows))
 
 
 def _judged(report: Report) -> Iterator[str]:

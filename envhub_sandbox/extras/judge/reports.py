@@ -92,8 +92,8 @@ def suite(report: Report, failures: Sequence[Finding]) -> ElementTree.Element:
 
 
 def _case(suite: ElementTree.Element, check: str, task: str) -> ElementTree.Element:
-    where = xml_text(task or "repository")
-    return ElementTree.SubElement(suite, "testcase", classname=where, name=check)
+    task_name = xml_text(task or "repository")
+    return ElementTree.SubElement(suite, "testcase", classname=task_name, name=check)
 
 
 def xml_text(text: str) -> str:

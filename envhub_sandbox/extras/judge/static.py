@@ -151,26 +151,26 @@ def _in_place(snapshot: Snapshot) -> Iterator[Finding]:
         yield from _links(snapshot)
         return
     try:
-        here = LocalFolder.of(snapshot)
-        if not isinstance(here.checkout, Checkout):
-            yield from _links_of_folder(here)
-            if is_unread(here.root):
+        folder = LocalFolder.of(snapshot)
+        if not isinstance(folder.checkout, Checkout):
+            yield from _links_of_folder(folder)
+            if is_unread(folder.root):
                 message = "git cannot say what its commit has: is it installed? Are its ids SHA-1?"
                 yield Finding("source-uncommitted", message)
         else:
             yield from _links(snapshot)
-            yield from _uncommitted(here.checkout, snapshot)
-        yield from _left_out(here)
+            yield from _uncommitted(folder.checkout, snapshot)
+        yield from _left_out(folder)
     except OSError as error:
         raise SnapshotError(f"{snapshot.label}: it has changed meanwhile: {error}") from error
 
 
 def _links(snapshot: Snapshot) -> Iterator[Finding]:
     """Finds git's links, which the Hub, and so a checkout, stores as files with their target."""
-    there = {record.path for record in snapshot.files}
-    there |= {str(parent) for path in there for parent in PurePosixPath(path).parents}
+    paths = {record.path for record in snapshot.files}
+    paths |= {str(parent) for path in paths for parent in PurePosixPath(path).parents}
     for record in snapshot.files:
-        target = _target(snapshot, record, there)
+        target = _target(snapshot, record, paths)
         if target is not None:
             message = f"reads like a link of git's, to {target}"
             yield Finding("source-link", message, file=record.path)
@@ -209,14 +209,14 @@ def _left_out(here: LocalFolder) -> Iterator[Finding]:
 
 def _in_front(snapshot: Snapshot) -> Iterator[Finding]:
     """Finds extension modules that Python imports instead of the source beside them."""
-    there = {record.path for record in snapshot.files}
-    for path in sorted(path for path in there if path.endswith(".so")):
+    paths = {record.path for record in snapshot.files}
+    for path in sorted(path for path in paths if path.endswith(".so")):
         folder, slash, name = path.rpartition("/")
         module = name.partition(".")[0]
         sources = [f"{folder}{slash}{module}.py"]
         if folder and module == "__init__":  # a package wins over a module of its name
             sources.append(f"{folder}.py")
-        for source in filter(there.__contains__, sources):
+        for source in filter(paths.__contains__, sources):
             message = f"machine code that runs in place of {source}"
             yield Finding("source-compiled", message, file=path)
 

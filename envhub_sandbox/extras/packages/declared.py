@@ -113,8 +113,8 @@ class WantedPackage:
     @property
     def is_open(self) -> bool:
         """Tells whether more than one release may satisfy it."""
-        pins = (one for one in self.requirement.specifier if one.operator in ("==", "==="))
-        exact = any(not one.version.endswith(".*") for one in pins)
+        pins = (clause for clause in self.requirement.specifier if clause.operator in ("==", "==="))
+        exact = any(not clause.version.endswith(".*") for clause in pins)
         return not (exact or self.hashes or self.requirement.url)
 
     def __str__(self) -> str:
@@ -313,10 +313,10 @@ def _script(path: Path, name: str) -> DeclaredPackages | None:
         return None
     if len(blocks) > 1:
         raise _unsupported(f"{name} has {len(blocks)} blocks {_SCRIPT!r}; one is permitted")
-    where = f"the script metadata of {name}"
-    data = _toml(blocks[0], where)
-    python = _specifier(data.get("requires-python", ""), where)
-    return DeclaredPackages(name, _list(data.get("dependencies", []), where), python)
+    origin = f"the script metadata of {name}"
+    data = _toml(blocks[0], origin)
+    python = _specifier(data.get("requires-python", ""), origin)
+    return DeclaredPackages(name, _list(data.get("dependencies", []), origin), python)
 
 
 def _block(lines: Sequence[str], start: int) -> str | None:
@@ -334,9 +334,9 @@ def _block(lines: Sequence[str], start: int) -> str | None:
 
 def _project(root: Path) -> DeclaredPackages:
     project = table(pyproject(root), "project")
-    where = f"[project] of {PROJECT}"
-    python = _specifier(project.get("requires-python", ""), where)
-    return DeclaredPackages(PROJECT, _list(project.get("dependencies", []), where), python)
+    origin = f"[project] of {PROJECT}"
+    python = _specifier(project.get("requires-python", ""), origin)
+    return DeclaredPackages(PROJECT, _list(project.get("dependencies", []), origin), python)
 
 
 def pyproject(root: Path, where: str = PROJECT) -> dict[str, Any]:

@@ -61,20 +61,20 @@ def main(words: Sequence[str] | None = None) -> int:
         if "check" in words:
             uv.command()
             return 0
-        given = [word.partition("=")[2] for word in words if word.startswith(_PIDFD)]
-        ended = int(given[0]) if given else None  # the pidfd of our parent
+        descriptors = [word.partition("=")[2] for word in words if word.startswith(_PIDFD)]
+        ended = int(descriptors[0]) if descriptors else None  # the pidfd of our parent
         order = json.load(sys.stdin)
         os.environ[CACHE_VARIABLE] = order["folder"]
         os.environ["UV_CACHE_DIR"] = str(_uv_cache(order))
         os.environ[bounds.BYTES_VARIABLE] = str(order["bytes"])
-        said = _made(order, ended) if "make" in words else _watched(order, ended)
+        reply = _made(order, ended) if "make" in words else _watched(order, ended)
     except DependencyError as error:
         if "check" in words:
             sys.stderr.write(f"{error}\n")
             return 1
-        said = {"error": error.reason, "said": str(error)[:_SAID_CHARS]}
-    if said:
-        _say(said)
+        reply = {"error": error.reason, "said": str(error)[:_SAID_CHARS]}
+    if reply:
+        _say(reply)
     return 0
 
 
@@ -98,15 +98,15 @@ def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     resolutions.BUILDER = None
     if not request.always and packages.HERE.meets(request):
         return {"own": True}
-    made = packages.HERE.make(request, lambda line: _say({"progress": line[:_WHERE_CHARS]}))
-    assert made.environment is not None
+    package_set = packages.HERE.make(request, lambda line: _say({"progress": line[:_WHERE_CHARS]}))
+    assert package_set.environment is not None
     return {
         "made": {
-            "name": made.environment.key,
-            "python": made.python,
-            "packages": made.packages,
-            "bytes": made.environment.size,
-            "facts": made.facts,
+            "name": package_set.environment.key,
+            "python": package_set.python,
+            "packages": package_set.packages,
+            "bytes": package_set.environment.size,
+            "facts": package_set.facts,
         }
     }
 

@@ -269,9 +269,9 @@ def _distribution(name: str) -> metadata.Distribution | None:
 
 def installed_from(name: str) -> str:
     """Returns the folder that a distribution here was installed from; empty if from none."""
-    found = _distribution(name)
+    dist = _distribution(name)
     with contextlib.suppress(ValueError, LookupError, TypeError):
-        facts = json.loads((found.read_text("direct_url.json") if found else None) or "{}")
+        facts = json.loads((dist.read_text("direct_url.json") if dist else None) or "{}")
         return str(facts["url"]) if isinstance(facts["dir_info"], dict) else ""
     return ""
 

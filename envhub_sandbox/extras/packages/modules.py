@@ -196,12 +196,12 @@ def note_missing(snapshot: Snapshot, said: str) -> bool:
     from envhub_sandbox.extras.sources.parsing import of_module
 
     module = match[1][:_LONGEST] if (match := re.search(_MISSING, said)) else ""
-    known = read(snapshot)
-    names = _WORKERS.union(name.partition(".")[0] for name, _, _ in known)
-    noted = sum(line == 0 for _, _, line in known)
+    imports = read(snapshot)
+    names = _WORKERS.union(name.partition(".")[0] for name, _, _ in imports)
+    noted = sum(line == 0 for _, _, line in imports)
     if not of_module(module) or module.partition(".")[0] in names or noted >= _MOST_NOTED:
         return False
-    rows = *known, (module, f"a package of it, which imports {module}", 0)
+    rows = *imports, (module, f"a package of it, which imports {module}", 0)
     _READ[snapshot.root, snapshot.path] = rows
     keep(*_place(snapshot), json.dumps(rows))
     return True
@@ -280,23 +280,23 @@ class MissingModule:
             return f"It ran in {self.python}: install the package there, or leave out that argument"
         if self.own:
             return f"It ran in an environment of its own; the package joins it with {extra}"
-        here = f"It ran in this interpreter ({sys.executable})"
+        ran = f"It ran in this interpreter ({sys.executable})"
         if self.where == "host" and says is not None and says.wanted:
             host = option_name("dependencies", "host")
-            return f"{here}, as {host} says; leave that out to give it an environment of its own"
-        return f"{here}; it gets an environment of its own, and the package in it, with {extra}"
+            return f"{ran}, as {host} says; leave that out to give it an environment of its own"
+        return f"{ran}; it gets an environment of its own, and the package in it, with {extra}"
 
     def _local(self, module: str, path: str) -> str:
         """Returns advice for a module that this process can import and the jail cannot."""
-        here = f"{module} is importable here at {path}, which the jail cannot see"
+        cause = f"{module} is importable here at {path}, which the jail cannot see"
         if self.place == "docker":
             image = option_name("sandbox", "docker:IMAGE")
-            return f"{here}: it ran in a container; name an image that has it, with {image}"
+            return f"{cause}: it ran in a container; name an image that has it, with {image}"
         if self.place == "remote":
-            return f"{here}: it ran on another host, whose operator has to install it"
+            return f"{cause}: it ran on another host, whose operator has to install it"
         if self.own:
             host = option_name("dependencies", "host")
-            return f"{here}: it ran in an environment of its own; {host} runs it in this one"
+            return f"{cause}: it ran in an environment of its own; {host} runs it in this one"
         python = self.python or sys.executable
         folders = Path(path).absolute().parents
         project = next(
@@ -308,10 +308,10 @@ class MissingModule:
         editable = "" if _built_on_import(module) else "-e "
         if project is not None:
             words = f"{python} -m pip install {editable}{project}"
-            return f"{here}. If you trust its code, which then runs here, too, install it: {words}"
+            return f"{cause}. If you trust its code, which then runs here, too, install it: {words}"
         folder = folders[Path(path).stem == "__init__"]
         return (
-            f"{here}: it has the packages of {python} alone. Copy the module into the repository, "
+            f"{cause}: it has the packages of {python} alone. Copy the module into the repository, "
             f"or write the line {folder} into a file NAME.pth in {sysconfig.get_path('purelib')}"
         )
 

@@ -161,8 +161,8 @@ def packages_for(
 def _is_unknown(repo_id: str, error: DependencyError) -> bool:
     """Tells whether the index lacks the package, or the version, that a reference names."""
     name = re.escape(re.sub(r"[-_.]+", "-", re.split(r"[\[#@]", repo_id)[0]).lower())
-    said = rf"no version of {name}\b|\b{name} was not found"
-    return error.reason == "resolution" and re.search(said, str(error)) is not None
+    pattern = rf"no version of {name}\b|\b{name} was not found"
+    return error.reason == "resolution" and re.search(pattern, str(error)) is not None
 
 
 def opened_lock(

@@ -125,24 +125,24 @@ def _adjusted(given: Mapping[str, Any]) -> Choice:
 
 
 def _requirements(given: Mapping[str, Any], name: str) -> tuple[WantedPackage, ...]:
-    found = given.get(name, ())
-    if not isinstance(found, (list, tuple)) or not all(isinstance(text, str) for text in found):
-        raise PolicyError(f"{name} in dependencies is {found!r}; it takes a list of requirements")
+    texts = given.get(name, ())
+    if not isinstance(texts, (list, tuple)) or not all(isinstance(text, str) for text in texts):
+        raise PolicyError(f"{name} in dependencies is {texts!r}; it takes a list of requirements")
     from envhub_sandbox.extras.packages.declared import parse_requirement
 
-    return tuple(parse_requirement(text, f"{text[:80]!r} in dependencies") for text in found)
+    return tuple(parse_requirement(text, f"{text[:80]!r} in dependencies") for text in texts)
 
 
 def _names(given: Mapping[str, Any]) -> tuple[str, ...]:
     from packaging.utils import canonicalize_name
 
-    found = _requirements(given, "without")
-    for package in found:
+    texts = _requirements(given, "without")
+    for package in texts:
         if str(package.requirement) != package.requirement.name:
             raise PolicyError(
                 f"without in dependencies has {str(package)!r}; it takes names of packages"
             )
-    return tuple(canonicalize_name(package.requirement.name) for package in found)
+    return tuple(canonicalize_name(package.requirement.name) for package in texts)
 
 
 def _python(given: object) -> str:

@@ -70,9 +70,9 @@ class WorkerActor:
             readable = readable_within(ready, STARTUP_S)
             words = answer.readline(_LINE_BYTES).decode().split() if readable else []
         if len(words) != 2:
-            what = "ended" if readable else f"was not ready after {STARTUP_S:.0f} s"
+            failure = "ended" if readable else f"was not ready after {STARTUP_S:.0f} s"
             self._process.kill()
-            raise RuntimeError(f"the worker server {what} ({sys.executable}):\n{self._tail()}")
+            raise RuntimeError(f"the worker server {failure} ({sys.executable}):\n{self._tail()}")
         return {"endpoint": words[0], "key": words[1], "node": node, "gpus": gpus}
 
     def _executed(self, bind: str, client_key: str, ready: int) -> subprocess.Popen[bytes]:

@@ -70,8 +70,8 @@ def connect(address: str = "") -> None:
             is_local = _started_here(address)
         except (ConnectionError, OSError, RuntimeError, ValueError) as error:
             text = printable(str(error), _SHOWN_CHARS)
-            where = f" at {address!r}" if address else ""
-            raise SandboxUnavailableError(f"Ray cannot be used{where}: {text}") from error
+            at_address = f" at {address!r}" if address else ""
+            raise SandboxUnavailableError(f"Ray cannot be used{at_address}: {text}") from error
         if is_local:
             cpus = ray.cluster_resources().get("CPU", 0)
             started = f"ray.init was not called: a local Ray with {cpus:g} CPUs was started"
@@ -144,11 +144,11 @@ class PlacedActor:
             raise SandboxUnavailableError(f"Ray cannot make the runtime_env: {text}") from error
         except ray.exceptions.RayError as error:
             raise _not_started(error) from error
-        said = read_answer(answer)
-        if "error" in said:
-            text = printable(str(said["error"]), _SHOWN_CHARS)
+        reply = read_answer(answer)
+        if "error" in reply:
+            text = printable(str(reply["error"]), _SHOWN_CHARS)
             raise WorkerStartupError(f"a worker server on a node of Ray: {text}")
-        return said
+        return reply
 
     def watch(self, ended: Callable[[], object]) -> None:
         """Call ``ended``, in any thread, once the server or the actor has ended."""
@@ -186,10 +186,10 @@ class PlacedActor:
         if error is not None:
             return f"Ray says: {_one_line(str(error).partition(_GUESSES)[0])}"
         try:
-            said = read_answer(answer.result())
+            reply = read_answer(answer.result())
         except WorkerStartupError as error:  # the caller of this reports another error
             return str(error)
-        code, log = _one_line(str(said.get("code"))), _one_line(str(said.get("log")))
+        code, log = _one_line(str(reply.get("code"))), _one_line(str(reply.get("log")))
         return f"it ended with {code}: {log}"
 
     def kill(self) -> None:
@@ -204,9 +204,9 @@ def read_answer(answer: object) -> dict[str, Any]:
     """Parse an actor's answer. Trust: input from a node. Raises ``WorkerStartupError``: invalid."""
     try:
         if type(answer) is bytes and len(answer) <= _MOST_BYTES:
-            said = json.loads(answer)
-            if type(said) is dict:
-                return said
+            document = json.loads(answer)
+            if type(document) is dict:
+                return document
     except (ValueError, RecursionError):
         pass
     raise WorkerStartupError("an actor on a node of Ray gave an answer of another program")

@@ -96,8 +96,8 @@ class RaySandbox(Sandbox):
 
     def __reduce__(self) -> Any:
         """Pickle only the arguments: the servers belong to this process."""
-        given = {option.name: getattr(self, option.name) for option in fields(self) if option.init}
-        return _made, (given,)
+        kept = {option.name: getattr(self, option.name) for option in fields(self) if option.init}
+        return _made, (kept,)
 
     def for_repository(
         self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
@@ -200,8 +200,8 @@ class RayServer(remote.RemoteServer):
         self._actor = PlacedActor(options.placement())
         try:  # interruption.md, rule 4
             ours = TcpServer(None, new_keys()[1], options.heartbeat_s, why_ended=self._why_ended)
-            said = self._actor.start(ours.public_key(), options.placement_s)
-            endpoint, key, self.node, self.gpus = read_started(said)
+            reply = self._actor.start(ours.public_key(), options.placement_s)
+            endpoint, key, self.node, self.gpus = read_started(reply)
             super().__init__(endpoint, replace(ours, server_key=key))
             self._actor.watch(self._wake)
         except BaseException:

@@ -56,7 +56,7 @@ def print_facts(server: RemoteSandbox, facts: ServerFacts, problem: str | None) 
         granted = {"network": facts.network, "gpu": facts.gpu, "dependencies": facts.dependencies}
         show("python", facts.python)
         show("profiles", f"{facts.profile} at most; policies may ask for {facts.weakest_profile}")
-        show("permits", ", ".join(name for name, given in granted.items() if given) or "no more")
+        show("permits", ", ".join(name for name, is_on in granted.items() if is_on) or "no more")
     else:
         out("It is older than this client, and does not say what it can enforce.")
     if facts.quotas:

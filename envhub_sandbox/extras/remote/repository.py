@@ -90,8 +90,8 @@ def upload(
     """
     wanted = _offer(client, files, deadline)
     by_hash = {file.sha256: file for file in files}
-    asked = {sha for sha in wanted.hashes if isinstance(sha, bytes)}  # a hash counts once
-    missing = [file for sha, file in by_hash.items() if sha in asked]
+    wanted_hashes = {sha for sha in wanted.hashes if isinstance(sha, bytes)}  # a hash counts once
+    missing = [file for sha, file in by_hash.items() if sha in wanted_hashes]
     if not wanted.hashes:
         return wanted.snapshot, 0
     _put(client, root, missing, deadline)
@@ -168,12 +168,12 @@ class ServerPackages:
             client = WorkerConnection(server.endpoint, server.process_fd, far=server.far)
             with contextlib.closing(client):
                 client.hello(Deadline(_HELLO_S))
-                made = request_packages(order, client, Deadline(_MAKE_S), tell)
+                packages = request_packages(order, client, Deadline(_MAKE_S), tell)
         finally:
             use.release()
-        if made is not None:
-            self.orders[made.packages] = order
-        return made
+        if packages is not None:
+            self.orders[packages.packages] = order
+        return packages
 
 
 def order_of(request: PackageRequest) -> m.NeedPackages:
@@ -223,14 +223,14 @@ def request_packages(
     shown = ""
     while True:
         reply, _ = client.request(order, deadline=deadline)
-        found = expect_reply(reply, m.Packages)
-        if found.state == "own":
+        answer = expect_reply(reply, m.Packages)
+        if answer.state == "own":
             return None
-        if found.state == "made":
-            return PackageSet(_name(found.name), _facts(found.facts, order))
-        if found.state != "making":
+        if answer.state == "made":
+            return PackageSet(_name(answer.name), _facts(answer.facts, order))
+        if answer.state != "making":
             raise RemoteProtocolError("the server reports an unknown state of packages")
-        line = printable(found.progress[:_MAX_CHARS], _MAX_CHARS)
+        line = printable(answer.progress[:_MAX_CHARS], _MAX_CHARS)
         if line != shown:
             tell(line)
             shown = line
@@ -309,10 +309,10 @@ class UploadedRepository(Sandbox):
         began = time.monotonic()
         deadline.postpone(_MAKE_S)
         try:
-            made = request_packages(order, client, deadline)
+            packages = request_packages(order, client, deadline)
         finally:
             deadline.postpone(time.monotonic() - began - _MAKE_S)
-        if made is None or made.packages != self.packages:
+        if packages is None or packages.packages != self.packages:
             raise DependencyError(
                 "the server no longer has these packages, and would choose other versions now: "
                 "make the environment again"

@@ -327,11 +327,11 @@ class ServerFacts:
 
     def enforces(self, profile: str) -> bool:
         """Whether the server can enforce a profile, and its operator permits it."""
-        known = (self.profile, profile, self.weakest_profile)
-        if not all(profile in PROFILES for profile in known):
+        profiles = (self.profile, profile, self.weakest_profile)
+        if not all(profile in PROFILES for profile in profiles):
             return False
-        strongest, asked, weakest = map(PROFILES.index, known)
-        return strongest <= asked <= weakest
+        strongest, wanted, weakest = map(PROFILES.index, profiles)
+        return strongest <= wanted <= weakest
 
 
 def ask_facts(sandbox: RemoteSandbox) -> ServerFacts:

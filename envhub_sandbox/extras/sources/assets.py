@@ -74,8 +74,8 @@ def _tree(text: str) -> Any:
         return yaml.compose(text, Loader=yaml.SafeLoader)
     except (yaml.YAMLError, ArithmeticError, RecursionError, ValueError) as error:
         mark = getattr(error, "problem_mark", None)
-        where = f" in line {mark.line + 2}" if mark else ""  # the first line is the ---
-        raise CardError(f"its YAML cannot be read: {type(error).__name__}{where}") from None
+        line = f" in line {mark.line + 2}" if mark else ""  # the first line is the ---
+        raise CardError(f"its YAML cannot be read: {type(error).__name__}{line}") from None
 
 
 def _value(node: Any, key: str) -> Any:
@@ -104,8 +104,8 @@ def with_assets(
         return snapshot
     with progress_shown("assets") as tell:
         hub = dict(hub) if given else {**hub, "public": True}
-        found = [_fetched(ref, where, tell, hub) for ref in wanted]
-        theirs = {(asset.repo_type, asset.repo_id.casefold()) for asset in found}
+        snapshots = [_fetched(ref, where, tell, hub) for ref in wanted]
+        theirs = {(asset.repo_type, asset.repo_id.casefold()) for asset in snapshots}
         left = DEFAULT_LIMITS.max_bytes
         for ref in declared:
             if any(_may_be(ref, *their) for their in theirs):
@@ -113,13 +113,13 @@ def with_assets(
             limits = replace(DEFAULT_LIMITS, max_bytes=max(1, left))
             taken = _fetched(ref, f"its {CARD}", tell, {**hub, "public": True}, limits)
             left -= sum(file.size for file in taken.files)
-            found.append(taken)
+            snapshots.append(taken)
             SNAPSHOT.info(
                 "%s: its %s declares %s as an asset, which the environment can read",
                 *(snapshot.label, CARD, taken.pinned),
             )
-    _check_distinct(snapshot, found)
-    return replace(snapshot, assets=tuple(found))
+    _check_distinct(snapshot, snapshots)
+    return replace(snapshot, assets=tuple(snapshots))
 
 
 def _declared(snapshot: Snapshot) -> list[HubRef]:

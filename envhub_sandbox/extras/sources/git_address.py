@@ -49,9 +49,9 @@ def read(text: str) -> Parts:
         raise Wrong("an address of git ends with the repository's path", GRAMMAR)
     head, colon, path = rest.partition(":")
     repo, at, revision = head.partition("@")
-    where = f"{scheme.lower()}://{host if '@' in host else host.lower()}/{repo.rstrip('/')}"
+    address = f"{scheme.lower()}://{host if '@' in host else host.lower()}/{repo.rstrip('/')}"
     path = normal_path(path) if colon else DEFAULT_PATH
-    return parts_of(KIND, where, revision if at else None, path)
+    return parts_of(KIND, address, revision if at else None, path)
 
 
 def _of_page(url: str) -> str:
@@ -69,8 +69,8 @@ def check(parts: Parts) -> None:
     scheme, _, rest = parts.repo_id.partition("://")
     host, _, repo = rest.partition("/")
     if "@" in host:
-        where = f"'git+{scheme}://{host.rpartition('@')[2]}/{repo}'"
-        raise Wrong("the address has a user or token in it, and none is sent", where)
+        address = f"'git+{scheme}://{host.rpartition('@')[2]}/{repo}'"
+        raise Wrong("the address has a user or token in it, and none is sent", address)
     if scheme not in PROTOCOLS:
         raise Wrong(f"files are not fetched by {scheme[:40]!r}", GRAMMAR)
     if host in HUB_HOSTS:

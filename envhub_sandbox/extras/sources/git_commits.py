@@ -88,15 +88,15 @@ def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
         )
     names = [f"refs/tags/{revision}^{{}}", f"refs/tags/{revision}", f"refs/heads/{revision}"]
     names = ["HEAD"] if revision == "HEAD" else names
-    with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
-        git = _Git(Path(place), variables)
+    with tempfile.TemporaryDirectory(prefix="envhub-git-") as folder:
+        git = _Git(Path(folder), variables)
         answer = git.run("ls-remote", "--quiet", _checked(url), *names)
     rows = answer.decode("utf-8", "replace").splitlines()  # other names may have the same end
-    found = {name: commit for commit, _, name in (row.partition("\t") for row in rows)}
-    commit = next((found[name] for name in names if name in found), "")
+    commits = {name: commit for commit, _, name in (row.partition("\t") for row in rows)}
+    commit = next((commits[name] for name in names if name in commits), "")
     if not is_commit(commit):
-        what = f"{url} has no tag or branch {revision!r}"
-        raise HubFailure(Kind.NO_REVISION, what, "Write all 40 digits of a commit")
+        failure = f"{url} has no tag or branch {revision!r}"
+        raise HubFailure(Kind.NO_REVISION, failure, "Write all 40 digits of a commit")
     return commit
 
 
@@ -162,8 +162,8 @@ def fetched(url: str, commit: str, variables: Variables | None = None) -> Iterat
     """
     source = _checked(url)
     title = f"{url}@{commit[:12]}"
-    with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
-        store = Path(place)
+    with tempfile.TemporaryDirectory(prefix="envhub-git-") as folder:
+        store = Path(folder)
         git = _Git(store, variables)
         git.fetch(source, commit)
         submodules: list[str] = []
@@ -252,8 +252,8 @@ class _Git:
         """
         program = shutil.which("git")
         if program is None:
-            what = "a git repository has to be downloaded, and git is not installed"
-            raise HubFailure(Kind.OTHER, what, "Install it, as in 'apt-get install git'")
+            failure = "a git repository has to be downloaded, and git is not installed"
+            raise HubFailure(Kind.OTHER, failure, "Install it, as in 'apt-get install git'")
         settings = [*_SETTINGS, *(f"protocol.{name}.allow=always" for name in address.PROTOCOLS)]
         command = [program, *(word for setting in settings for word in ("-c", setting)), *arguments]
         store = self._store
@@ -267,9 +267,9 @@ class _Git:
                 why = f"it took longer than {self._timeout_s:.0f} s" if late else str(error)
                 said.seek(max(0, said.seek(0, os.SEEK_END) - _SAID_BYTES))
                 text = said.read(_SAID_BYTES).decode("utf-8", "replace") or why
-                what = f"git {arguments[0]} failed: {printable(text, _SAID_BYTES).strip()}"
+                failure = f"git {arguments[0]} failed: {printable(text, _SAID_BYTES).strip()}"
                 advice = "Check the address, the commit and the network"
-                raise HubFailure(Kind.UNREACHABLE, what, advice) from error
+                raise HubFailure(Kind.UNREACHABLE, failure, advice) from error
             kept.seek(0)
             return kept.read(_BLOCK)
 

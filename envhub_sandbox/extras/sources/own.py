@@ -76,14 +76,14 @@ def own_files(root: Path, entry: str, checkout: Checkout | None) -> set[str]:
 def _read(texts: dict[str, bytes]) -> dict[str, parsing.ParsedFile | None]:
     """Parses each text, unless this process has parsed it before."""
     parsed_before = dict(_KNOWN)  # a copy, since other threads may parse files too
-    found = parsing.parsed(
+    fresh = parsing.parsed(
         {file: text for file, text in texts.items() if text not in parsed_before}
     )
     if len(parsed_before) > _MOST_KNOWN:
         _KNOWN.clear()
-    _KNOWN.update((texts[file], one) for file, one in found.items())
+    _KNOWN.update((texts[file], one) for file, one in fresh.items())
     return {
-        file: found[file] if file in found else parsed_before[text] for file, text in texts.items()
+        file: fresh[file] if file in fresh else parsed_before[text] for file, text in texts.items()
     }
 
 

@@ -91,14 +91,14 @@ def read(snapshot: Snapshot) -> dict[str, ParsedFile | None]:
     that crashed the parser.
     """
     names = sorted(file.path for file in snapshot.files if file.path.endswith(".py"))
-    found: dict[str, ParsedFile | None] = dict.fromkeys(names)
+    parsed_files: dict[str, ParsedFile | None] = dict.fromkeys(names)
     left, texts = MOST_BYTES_IN_ALL, {}
     for name in names:
         data = content(snapshot.root / name, MOST_BYTES)
         if data is not None and len(data) <= left:
             left -= len(data)
             texts[name] = data
-    return {**found, **parsed(texts)}
+    return {**parsed_files, **parsed(texts)}
 
 
 def content(path: Path, most: int) -> bytes | None:
@@ -122,16 +122,16 @@ def _open_no_link(path: str, flags: int) -> int:
 
 def parsed(texts: Mapping[str, bytes]) -> dict[str, ParsedFile | None]:
     """Parses each text; None for a text that cost a child too much."""
-    found: dict[str, ParsedFile | None] = dict.fromkeys(texts)
+    parsed_files: dict[str, ParsedFile | None] = dict.fromkeys(texts)
     waiting = list(texts)
     for _ in range(MOST_LOST):
         if not waiting:
             break
         answers = list(_answers([texts[name] for name in waiting]))
         for name, answer in zip(waiting, answers, strict=False):
-            found[name] = answer
+            parsed_files[name] = answer
         waiting = waiting[len(answers) + 1 :]  # the next text ended the child
-    return found
+    return parsed_files
 
 
 def _answers(texts: list[bytes]) -> Iterator[ParsedFile | None]:
@@ -161,10 +161,10 @@ def _answer(row: Any) -> ParsedFile | None:
         return None
     if not row or "encoding" in row:
         return ParsedFile(is_python=bool(row), **row)
-    whole = row.pop("is_whole")
-    found: dict[str, Any] = {kind: tuple(map(tuple, rows)) for kind, rows in row.items()}
-    found["imports"] = tuple(ImportStatement(*statement) for statement in row["imports"])
-    return ParsedFile(is_whole=whole, **found)
+    is_whole = row.pop("is_whole")
+    fields: dict[str, Any] = {kind: tuple(map(tuple, rows)) for kind, rows in row.items()}
+    fields["imports"] = tuple(ImportStatement(*statement) for statement in row["imports"])
+    return ParsedFile(is_whole=is_whole, **fields)
 
 
 Files = Mapping[str, ParsedFile | None]

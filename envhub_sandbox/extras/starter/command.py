@@ -269,7 +269,7 @@ def starter(name: str, year: int, *, lerobot: bool = False) -> dict[str, str]:
     """Returns the files of a new repository, by path.
     ``lerobot``: whether its observations have the keys of LeRobot's policies.
     """
-    given = {"name": name, "year": str(year)}
+    values = {"name": name, "year": str(year)}
     chosen = _FOR_LEROBOT if lerobot else _PLAIN
-    given |= {key: Template(text).substitute(given) for key, text in chosen.items()}
-    return {path: text.substitute(given) for path, text in _FILES.items()}
+    values |= {key: Template(text).substitute(values) for key, text in chosen.items()}
+    return {path: text.substitute(values) for path, text in _FILES.items()}

@@ -68,9 +68,9 @@ def _print_packages(read: Static) -> None:
         show("packages", f"{len(says.wanted)} in {says.source}{python}")
     for package in says.wanted if says else ():
         show("  package", str(package))
-    for name, place in sorted(read.modules.items()):
-        known = "" if read.is_brought(name) else ", and no package of that name is declared"
-        show("  import", f"{name}: {place.file}:{place.line}{known}")
+    for name, imported in sorted(read.modules.items()):
+        note = "" if read.is_brought(name) else ", and no package of that name is declared"
+        show("  import", f"{name}: {imported.file}:{imported.line}{note}")
 
 
 def _print_files(read: Static) -> None:

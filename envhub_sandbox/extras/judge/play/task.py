@@ -150,10 +150,10 @@ class TaskJudge:
 
     def _of(self, suites: EnvSuites) -> Env:
         """Returns this task's environment. Raises ``LoadError``: make_env now has other names."""
-        found: Mapping[Any, Env] = suites.get(self._suite, {})
-        if self._task not in found:
+        tasks: Mapping[Any, Env] = suites.get(self._suite, {})
+        if self._task not in tasks:
             raise LoadError(f"there is no {self._name} any more")
-        return found[self._task]
+        return tasks[self._task]
 
     def _compare(self, first: Trace, mode: str | None) -> None:
         """Compare plays: in another process, again in the same process, and over two processes."""
@@ -246,8 +246,8 @@ class TaskJudge:
         self._holds("endless-unknown", known, f"{text}, for which there were {_EPISODE_S:g} s")
         if known:
             will_end = limit is not None and played < limit <= most
-            said = "" if limit is None else f", where its limit is {limit:,}"
-            self._holds("endless", ended or will_end, f"{text}{said}")
+            limited = "" if limit is None else f", where its limit is {limit:,}"
+            self._holds("endless", ended or will_end, f"{text}{limited}")
 
     def _unseeded(self, env: Env, most: int) -> None:
         """Judge the resets without a seed."""
@@ -364,8 +364,8 @@ class TaskJudge:
         space = self._env.single_observation_space
         with contextlib.suppress(CustomSpaceError):  # the space's code is not in this process
             if _would_be_cast(observation, space) or not space.contains(observation):
-                given = batches.shown(observation)
-                yield f"sub-environment 0 gave {given}, which is not in {space}"
+                shown = batches.shown(observation)
+                yield f"sub-environment 0 gave {shown}, which is not in {space}"
 
 
 def _would_be_cast(value: Any, space: spaces.Space[Any]) -> bool:

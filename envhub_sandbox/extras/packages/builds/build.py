@@ -224,28 +224,28 @@ class _Build:
         return old if is_setuptools and not project.advice(log) and old[0] not in tried else ()
 
     def _tried(self, further: tuple[str, ...]) -> Path:
-        known: tuple[str, ...] = ()
+        requirements: tuple[str, ...] = ()
         for number in range(_ROUNDS):
-            packages, lock = self._environment((*further, *known))
+            packages, lock = self._environment((*further, *requirements))
             self._tell(f"building {_title(self._source)} in a jail")
             folder = Path(tempfile.mkdtemp(prefix=f"try-{number}-", dir=self._place))
             folder.chmod(0o755)
-            result = _in_jail(self._order(packages, known), folder)
+            result = _in_jail(self._order(packages, requirements), folder)
             if isinstance(result, Path):
                 source, interpreter = self._source, self._interpreter
                 apart.check_wheel(result, source.name, source.version, interpreter)
                 return wheels.keep(result, self._source, lock, self._interpreter)
-            known = (*known, *result)
+            requirements = (*requirements, *result)
         raise BuildFailedError("its build backend always asks for further packages")
 
     def _environment(self, further: Iterable[str]) -> tuple[Path, str]:
         """Returns the folder of the build requirements, and the hash of their lock."""
-        where = f"what {_title(self._source)} is built with"
-        wanted = [*self._project.requires, *(parse_requirement(text, where) for text in further)]
+        origin = f"what {_title(self._source)} is built with"
+        wanted = [*self._project.requires, *(parse_requirement(text, origin) for text in further)]
         if not wanted:
             (self._place / "nothing").mkdir(exist_ok=True)
             return self._place / "nothing", Lock("").digest
-        request = PackageRequest(where, tuple(wanted), runs_worker=False)
+        request = PackageRequest(origin, tuple(wanted), runs_worker=False)
         lock = self._choose(request, self._interpreter, self._tell)
         return environments.provide(lock, self._interpreter, self._tell).packages, lock.digest
 

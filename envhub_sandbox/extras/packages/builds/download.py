@@ -53,9 +53,9 @@ def download(url: str, sha256: str, target: Path) -> None:
         raise DependencyError(f"{shown} cannot be downloaded: {error}", reason="index") from error
     if size > MAX_BYTES:
         raise DependencyError(f"{shown} has more than {size_text(MAX_BYTES)}", reason="size")
-    if (found := digest.hexdigest()) != sha256:
+    if (actual := digest.hexdigest()) != sha256:
         raise DependencyError(
-            f"{shown} has the SHA-256 {found}, and the index or the lock says {sha256}: it was "
+            f"{shown} has the SHA-256 {actual}, and the index or the lock says {sha256}: it was "
             "replaced. Nothing of it was kept",
             reason="integrity",
         )

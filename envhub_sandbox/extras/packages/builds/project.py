@@ -27,20 +27,20 @@ class Project:
 
 def read(tree: Path, title: str) -> Project:
     """Reads the build settings; without settings, setuptools builds the sources."""
-    where = f"[build-system] of {title}"
-    build_system = pyproject(tree, where).get("build-system", {})
+    table = f"[build-system] of {title}"
+    build_system = pyproject(tree, table).get("build-system", {})
     if not isinstance(build_system, dict):
-        raise DependencyError(f"{where} is not a table", reason="requirement")
-    requires = _texts(build_system.get("requires", list(_LEGACY)), where)
+        raise DependencyError(f"{table} is not a table", reason="requirement")
+    requires = _texts(build_system.get("requires", list(_LEGACY)), table)
     backend = build_system.get("build-backend", _LEGACY_BACKEND)
-    paths = _texts(build_system.get("backend-path", []), where)
+    paths = _texts(build_system.get("backend-path", []), table)
     if not isinstance(backend, str) or not all(
         map(str.isidentifier, backend.replace(":", ".", 1).split("."))
     ):
         raise DependencyError(
-            f"{where}: {str(backend)[:200]!r} is not a build backend", reason="requirement"
+            f"{table}: {str(backend)[:200]!r} is not a build backend", reason="requirement"
         )
-    return Project(tuple(parse_requirement(text, where) for text in requires), backend, paths)
+    return Project(tuple(parse_requirement(text, table) for text in requires), backend, paths)
 
 
 def _texts(found: object, where: str) -> tuple[str, ...]:
@@ -126,8 +126,8 @@ def advice(log: str) -> str:
 
 def _program(log: str) -> str:
     for pattern in _PROGRAM_PATTERNS:
-        for found in re.finditer(pattern, log):
-            name = found[1].rpartition("/")[2].lower()
+        for match in re.finditer(pattern, log):
+            name = match[1].rpartition("/")[2].lower()
             short = re.sub(r"^[a-z0-9_]+-linux-gnu-", "", name)
             if short in _PROGRAMS:
                 return short

@@ -141,9 +141,9 @@ class BoundedStream(io.RawIOBase):
         """Reads at most ``size`` bytes; a read of the whole rest is bounded too."""
         self._check(0 if size < 0 else size, self._at_once)
         self._check(self._stream.tell(), _FAR)
-        found = self._stream.read(self._at_once + 1 if size < 0 else size)
-        self._check(len(found), self._at_once)
-        return found
+        data = self._stream.read(self._at_once + 1 if size < 0 else size)
+        self._check(len(data), self._at_once)
+        return data
 
     def seek(self, offset: int, whence: int = 0) -> int:
         """Seek like any file, within the bound."""
@@ -177,11 +177,11 @@ class _ForwardStream:
         """Returns the next ``size`` bytes; none at the end, if the stream may end here."""
         if size > AT_ONCE or self.at + size > _FAR:
             raise DependencyError(f"{self._title} is too large to be unpacked", reason="size")
-        found = self._stream.read(size)
-        if len(found) != size and (found or not may_end):
+        data = self._stream.read(size)
+        if len(data) != size and (data or not may_end):
             raise not_as_expected(f"{self._title} cannot be unpacked: its end is missing")
-        self.at += len(found)
-        return found
+        self.at += len(data)
+        return data
 
     def skip_to(self, end: int) -> None:
         """Skip the bytes before a position."""
@@ -256,7 +256,7 @@ def _said(kind: bytes, data: bytes, title: str) -> dict[str, str]:
     if kind in _LONG:
         name = data.partition(b"\0")[0].decode("utf-8", "surrogateescape")
         return {_LONG[kind]: name}
-    said, at = {}, 0
+    fields, at = {}, 0
     while record := _RECORD.match(data, at):
         end = at + int(record[1])
         if not record.end() < end <= len(data):
@@ -265,11 +265,11 @@ def _said(kind: bytes, data: bytes, title: str) -> dict[str, str]:
         if name.startswith("GNU.sparse") or (kind == tarfile.XGLTYPE and name in ("path", "size")):
             raise not_as_expected(f"{title} is packed with {name}, which is not read")
         if name in ("path", "size"):
-            said[name] = data[record.end() : end - 1].decode("utf-8", "surrogateescape")
+            fields[name] = data[record.end() : end - 1].decode("utf-8", "surrogateescape")
         at = end
     if data[at:].strip(b"\0"):
         raise not_as_expected(f"{title} cannot be unpacked: it has a malformed header")
-    return said
+    return fields
 
 
 def check_zip(members: Sequence[zipfile.ZipInfo], title: str) -> None:

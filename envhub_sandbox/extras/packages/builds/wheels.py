@@ -171,13 +171,13 @@ def _small(archive: zipfile.ZipFile, path: str) -> bytes:
 def _record(archive: zipfile.ZipFile, path: str) -> None:
     """Require RECORD to list every file with its hash, and no other file."""
     rows = list(csv.reader(io.StringIO(_small(archive, path).decode())))
-    said = {row[0]: row[1] for row in rows if len(row) == 3}
-    there = {member.filename for member in archive.infolist() if not member.is_dir()}
+    digests = {row[0]: row[1] for row in rows if len(row) == 3}
+    names = {member.filename for member in archive.infolist() if not member.is_dir()}
     signatures = {path, f"{path}.jws", f"{path}.p7s"}
-    if there - said.keys() - signatures or said.keys() - there - signatures:
+    if names - digests.keys() - signatures or digests.keys() - names - signatures:
         raise not_as_expected("its RECORD lists other files than it has")
-    for name in sorted(there - signatures):
-        if said[name] != _digest(archive, name):
+    for name in sorted(names - signatures):
+        if digests[name] != _digest(archive, name):
             raise not_as_expected(f"{name[:200]!r} is not the file that its RECORD says")
 
 

@@ -29,24 +29,24 @@ def _environment(snapshot: Snapshot, make: opt.MakeOptions, upgrade: bool) -> En
     from envhub_sandbox.extras.packages import packages
     from envhub_sandbox.extras.packages.request import chosen
 
-    given, lock = make["dependencies"], make["lock"]
+    dependencies, lock = make["dependencies"], make["lock"]
     if lock is not None:
-        opened = packages.opened_lock(lock, "process", None, given)
+        opened = packages.opened_lock(lock, "process", None, dependencies)
         return packages.locked_packages(snapshot, opened).environment
-    place = packages.ThisMachine(upgrade=upgrade)
-    made = packages.packages_for(snapshot, chosen(given, None)[0], place)
-    return None if made is None else made.environment
+    target = packages.ThisMachine(upgrade=upgrade)
+    package_set = packages.packages_for(snapshot, chosen(dependencies, None)[0], target)
+    return None if package_set is None else package_set.environment
 
 
 def _document(snapshot: Snapshot, environment: Environment | None) -> dict[str, Any]:
-    made = environment and {
+    installed = environment and {
         "folder": str(environment.home),
         "python": environment.python,
         "version": environment.version,
         "bytes": environment.size,
         **environment.facts,
     }
-    return {"reference": snapshot.reference, "commit": snapshot.commit, "environment": made}
+    return {"reference": snapshot.reference, "commit": snapshot.commit, "environment": installed}
 
 
 def _print(snapshot: Snapshot, environment: Environment | None) -> None:

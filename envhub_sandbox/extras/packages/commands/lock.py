@@ -106,13 +106,13 @@ def lock(
         old = _old(path, upgrade)
         snapshot = make.snapshot_with_assets(ref, () if old is None else old.assets)
         choice = _choice(make["dependencies"], old)
-        made = making.locked(snapshot, choice, upgrade=upgrade)
+        written = making.locked(snapshot, choice, upgrade=upgrade)
         if not no_spaces:
             kwargs = _kwargs(make["env_kwargs"], old)
-            made = _with_spaces(made, snapshot, kwargs, make.source)
-        changes = [] if old is None else making.differences(old, made)
-        lockfile.write(made, path)
-    _print(path, made, changes, old is not None, as_json=json)
+            written = _with_spaces(written, snapshot, kwargs, make.source)
+        changes = [] if old is None else making.differences(old, written)
+        lockfile.write(written, path)
+    _print(path, written, changes, old is not None, as_json=json)
 
 
 def _verify(
@@ -130,18 +130,18 @@ def _verify(
         from envhub_sandbox.extras.packages.locks import lockfile, making
 
         locked = lockfile.read(file)
-        place = _reference(ref, locked, file)
+        reference = _reference(ref, locked, file)
         if ref is None:  # the reference is the lock's, which may be a stranger's
-            make.snapshot(place, public=True)
-        snapshot = make.snapshot_with_assets(place, locked.assets)
+            make.snapshot(reference, public=True)
+        snapshot = make.snapshot_with_assets(reference, locked.assets)
         now = _now(locked, snapshot, no_index=no_index)
         if not (no_spaces or locked.spaces is None or making.differences(locked, now)):
             kwargs = opt.read_env_kwargs([locked.spaces.arguments])
             now = _with_spaces(locked, snapshot, kwargs, make.source)
-        found = making.differences(locked, now)
+        differing = making.differences(locked, now)
     if json:
-        print_json({"lock": str(file), "reference": snapshot.label, "drift": found})
-    making.refuse(found, snapshot.label)
+        print_json({"lock": str(file), "reference": snapshot.label, "drift": differing})
+    making.refuse(differing, snapshot.label)
     if not json:
         say(f"{snapshot.label} is as it was locked in {file}.", GOOD)
 
@@ -237,18 +237,18 @@ def _with_spaces(
 def _reference(ref: str | None, locked: LockFile, file: Path) -> str:
     from envhub_sandbox.extras.packages.locks import lockfile
 
-    found = ref or lockfile.reference_of(locked)
-    if found is None:
+    reference = ref or lockfile.reference_of(locked)
+    if reference is None:
         raise UsageError(f"{file} locks a folder; name it: envhub lock --check {file} ./FOLDER")
-    return found
+    return reference
 
 
 def _now(locked: LockFile, snapshot: Snapshot, *, no_index: bool) -> LockFile:
     from envhub_sandbox.extras.packages import interpreters
     from envhub_sandbox.extras.packages.locks import lockfile, making
 
-    here = lockfile.Runner.of(interpreters.find(locked.runner.python))
-    now = replace(making.with_files(locked, snapshot), runner=here)
+    runner = lockfile.Runner.of(interpreters.find(locked.runner.python))
+    now = replace(making.with_files(locked, snapshot), runner=runner)
     return now if no_index else replace(now, packages=making.relisted(locked).packages)
 
 

@@ -109,12 +109,12 @@ def days_for(snapshot: Snapshot, error: EnvHubError) -> list[str]:
 
 def _may_be_outdated(error: EnvHubError) -> bool:
     """Tells whether older packages may cure an error: its text or traceback points to a package."""
-    said = _said_at_start(error)
+    message = _said_at_start(error)
     remote = _remote(error)
-    if not said or remote is None or isinstance(remote, (OSError, EOFError, MemoryError)):
+    if not message or remote is None or isinstance(remote, (OSError, EOFError, MemoryError)):
         return False
     raised_in = re.findall(_FRAME_FILE, remote.traceback)[-1:]
-    return bool(_OUTDATED.search(said)) or any("/packages/" in file for file in raised_in)
+    return bool(_OUTDATED.search(message)) or any("/packages/" in file for file in raised_in)
 
 
 def _said_at_start(error: EnvHubError) -> str:

@@ -173,12 +173,12 @@ class _Reader:
 
     def lock(self, packages: tuple[PylockPackage, ...]) -> LockFile:
         text, ours = self._text, self._ours
-        found: dict[str, Any] = {name: text(ours, name, form) for name, form in _TEXTS.items()}
+        texts: dict[str, Any] = {name: text(ours, name, form) for name, form in _TEXTS.items()}
         if "exclude-newer" in ours:
-            found["exclude_newer"] = text(ours, "exclude-newer", re.compile(DATE))
-        found |= {name: self._requirements(name) for name in _REQUIREMENTS if name in ours}
+            texts["exclude_newer"] = text(ours, "exclude-newer", re.compile(DATE))
+        texts |= {name: self._requirements(name) for name in _REQUIREMENTS if name in ours}
         return LockFile(
-            **found,
+            **texts,
             files=self._files(),
             runner=Runner(**{name: text(ours, name, form) for name, form in _RUNNER.items()}),
             packages=packages,

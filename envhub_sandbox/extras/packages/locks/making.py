@@ -116,10 +116,10 @@ def _of_package(then: PylockPackage, now: PylockPackage) -> Iterator[str]:
     )
     if before != after:
         yield f"package {then.name}: built of {before or 'no source'}, this of {after or 'none'}"
-    there = {wheel.sha256 for wheel in now.wheels}
+    hashes = {wheel.sha256 for wheel in now.wheels}
     for wheel in then.wheels:
-        if wheel.sha256 not in there:
-            others = ", ".join(sorted(digest[:12] for digest in there)) or "none"
+        if wheel.sha256 not in hashes:
+            others = ", ".join(sorted(digest[:12] for digest in hashes)) or "none"
             yield (
                 f"package {then.name}=={then.version}: the file with SHA-256 "
                 f"{wheel.sha256[:12]}... was locked, there is {others}"
@@ -139,15 +139,15 @@ def drift_of_tasks(
         if old.mode != new.mode:
             yield f"environment {shown}: autoreset mode {old.mode or 'none'}, now {new.mode}"
         if old.spaces != new.spaces:
-            said = [
-                f"{what} were {before}, now {after}"
-                for what, before, after in (
+            drifts = [
+                f"{field} were {before}, now {after}"
+                for field, before, after in (
                     ("observations", old.observations, new.observations),
                     ("actions", old.actions, new.actions),
                 )
                 if before != after
             ]
-            text = "; ".join(said) or "other bounds or types in its spaces, which read the same"
+            text = "; ".join(drifts) or "other bounds or types in its spaces, which read the same"
             yield f"environment {shown}: {text}"
 
 

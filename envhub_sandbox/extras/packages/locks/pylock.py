@@ -120,8 +120,8 @@ def listed(
         given="".join(f"{version}\n" for version in versions if "==" in version),
         timeout_s=_DESCRIBE_S,
     )
-    where = "the answer of uv"
-    return read(document(text, where), where)
+    origin = "the answer of uv"
+    return read(document(text, origin), origin)
 
 
 def document(text: str, where: str) -> dict[str, Any]:
@@ -173,13 +173,13 @@ def _package(given: object, where: str) -> PylockPackage:
 
 
 def _wheel(given: object, where: str) -> Wheel:
-    found = table(given, "hashes").get("sha256")
-    if not isinstance(given, dict) or not _is(found, _SHA256):
+    sha256 = table(given, "hashes").get("sha256")
+    if not isinstance(given, dict) or not _is(sha256, _SHA256):
         raise LockError(f"a wheel of {where} has no SHA-256")
     url, size = given.get("url", ""), given.get("size")
     if type(size) is not int or size < 0:
         size = None
-    return Wheel(found, without_login(url) if isinstance(url, str) else "", size)
+    return Wheel(sha256, without_login(url) if isinstance(url, str) else "", size)
 
 
 def _is(value: object, form: re.Pattern[str]) -> TypeGuard[str]:
@@ -206,8 +206,8 @@ def _origin(given: Mapping[str, Any], name: str, version: str, where: str) -> Wh
 def _of_git(vcs: Mapping[str, Any], name: str, version: str, where: str) -> Source:
     below = f"#subdirectory={vcs['subdirectory']}" if vcs.get("subdirectory") else ""
     try:
-        asked = Requirement(f"{name} @ git+{vcs.get('url')}@{vcs.get('commit-id')}{below}")
-        found = of_git(asked, where)
+        requirement = Requirement(f"{name} @ git+{vcs.get('url')}@{vcs.get('commit-id')}{below}")
+        found = of_git(requirement, where)
     except InvalidRequirement:
         found = None
     if found is None or not _COMMIT.fullmatch(found.commit):

@@ -41,10 +41,10 @@ _YES = ("1", "true", "yes", "on")
 
 def environment(variables: Mapping[str, str] | None = None) -> dict[str, str]:
     """Builds uv's environment from the user's variables (default: this process's)."""
-    given = os.environ if variables is None else variables
-    kept = {name: value for name, value in given.items() if value and _KEPT.fullmatch(name)}
+    env = os.environ if variables is None else variables
+    kept = {name: value for name, value in env.items() if value and _KEPT.fullmatch(name)}
     if not any(name in kept for name in _CHOOSE_AN_INDEX):
-        kept |= _as_uv_says(pip_settings(given), kept)
+        kept |= _as_uv_says(pip_settings(env), kept)
     ours = {name: _from_here(name, value) for name, value in kept.items()}
     return own_variables() | ours | _FIXED
 
@@ -62,15 +62,15 @@ def _absolute(place: str) -> str:
 
 def uv_cache() -> Path:
     """Returns the folder where uv keeps and unpacks downloads."""
-    found = environment()
-    home = found.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(found.get("UV_CACHE_DIR") or os.path.join(home, "uv"))
+    variables = environment()
+    home = variables.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(variables.get("UV_CACHE_DIR") or os.path.join(home, "uv"))
 
 
 def is_chosen() -> bool:
     """Tells whether the user has named an index."""
-    found = environment()
-    return any(name in found for name in _CHOOSE_AN_INDEX)
+    variables = environment()
+    return any(name in variables for name in _CHOOSE_AN_INDEX)
 
 
 def hides_refusals() -> bool:
@@ -85,9 +85,9 @@ def options() -> tuple[str, ...]:
 
 def places() -> list[str]:
     """Returns the settings for the source of packages as ``NAME=value``; may include passwords."""
-    found = environment()
+    variables = environment()
     names = (*_CHOOSE_AN_INDEX, "UV_INDEX_STRATEGY", "UV_EXCLUDE_NEWER", "UV_TORCH_BACKEND")
-    return [f"{name}={found[name]}" for name in names if name in found]
+    return [f"{name}={variables[name]}" for name in names if name in variables]
 
 
 def pip_settings(variables: Mapping[str, str]) -> dict[str, str]:
@@ -95,20 +95,20 @@ def pip_settings(variables: Mapping[str, str]) -> dict[str, str]:
 
     Skips unreadable files.
     """
-    found: dict[str, str] = {}
+    settings: dict[str, str] = {}
     for path in _pip_files(variables):
         parser = configparser.RawConfigParser()
         try:
             parser.read(path, "utf-8")
             sections = [name for name in ("global", "install") if parser.has_section(name)]
             for section in sections:
-                found |= {k.replace("_", "-"): v for k, v in parser.items(section)}
+                settings |= {k.replace("_", "-"): v for k, v in parser.items(section)}
         except (OSError, ValueError, configparser.Error):
             continue
     for name, value in variables.items():
         if name.startswith("PIP_") and value:
-            found[name[4:].lower().replace("_", "-")] = value
-    return found
+            settings[name[4:].lower().replace("_", "-")] = value
+    return settings
 
 
 def _pip_files(variables: Mapping[str, str]) -> list[Path]:
@@ -126,21 +126,21 @@ def _pip_files(variables: Mapping[str, str]) -> list[Path]:
 
 
 def _as_uv_says(pip: Mapping[str, str], kept: Mapping[str, str]) -> dict[str, str]:
-    said: dict[str, str] = {}
+    variables: dict[str, str] = {}
     if index := pip.get("index-url", "").strip():
-        said["UV_DEFAULT_INDEX"] = index
+        variables["UV_DEFAULT_INDEX"] = index
     if more := pip.get("extra-index-url", "").split():
-        said["UV_INDEX"] = " ".join(more)
+        variables["UV_INDEX"] = " ".join(more)
         # pip has no first index: it takes the best version among all indexes
-        said["UV_INDEX_STRATEGY"] = kept.get("UV_INDEX_STRATEGY", "unsafe-best-match")
+        variables["UV_INDEX_STRATEGY"] = kept.get("UV_INDEX_STRATEGY", "unsafe-best-match")
     if links := pip.get("find-links", "").split():
-        said["UV_FIND_LINKS"] = ",".join(links)
+        variables["UV_FIND_LINKS"] = ",".join(links)
     if pip.get("no-index", "").strip().lower() in _YES:
-        said["UV_NO_INDEX"] = "1"
+        variables["UV_NO_INDEX"] = "1"
     if (certificate := pip.get("cert", "").strip()) and "SSL_CERT_FILE" not in kept:
-        said["SSL_CERT_FILE"] = certificate
+        variables["SSL_CERT_FILE"] = certificate
     if hosts := pip.get("trusted-host", "").split():
-        said["UV_INSECURE_HOST"] = " ".join(hosts)
+        variables["UV_INSECURE_HOST"] = " ".join(hosts)
     if proxy := pip.get("proxy", "").strip():
-        said |= {name: proxy for name in ("HTTP_PROXY", "HTTPS_PROXY") if name not in kept}
-    return said
+        variables |= {name: proxy for name in ("HTTP_PROXY", "HTTPS_PROXY") if name not in kept}
+    return variables

@@ -72,36 +72,38 @@ def resolution_for(
     """
     first = interpreters.find(request.python, request.supports, fetch=request.fetch_python)
     key = key_of(request, first)
-    known = None if upgrade else recall(key)
-    if known is not None:
-        return known
+    recalled = None if upgrade else recall(key)
+    if recalled is not None:
+        return recalled
     tell(f"choosing versions for {request.source}")
-    found = _chosen(request, first, upgrade, tell)
+    resolution = _chosen(request, first, upgrade, tell)
     strict = option_name("dependencies", "declared")
-    for one in request.guesses:
-        if one.module in found.taken:
+    for guess in request.guesses:
+        if guess.module in resolution.taken:
             text = (
-                f"{one.wanted.requirement} is installed, which nothing declares "
-                f"({one.wanted.where}); {strict} takes what is declared alone"
+                f"{guess.wanted.requirement} is installed, which nothing declares "
+                f"({guess.wanted.where}); {strict} takes what is declared alone"
             )
             warnings.warn(text, stacklevel=2)
-    remember(key, found)
-    return found
+    remember(key, resolution)
+    return resolution
 
 
 def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Tell) -> Resolution:
     """Chooses the first interpreter that has versions, from wheels alone if possible."""
     tried: list[str] = []
     failed: list[DependencyError] = []
-    for asked, builder in _attempts(request):
+    for attempt, builder in _attempts(request):
         failed.clear()
-        for one in _candidates(first, request):
-            tried.append(one.version)
-            lock = partial(_lock_for, interpreter=one, tell=tell, builder=builder, refresh=refresh)
+        for candidate in _candidates(first, request):
+            tried.append(candidate.version)
+            lock = partial(
+                _lock_for, interpreter=candidate, tell=tell, builder=builder, refresh=refresh
+            )
             try:
-                found, taken = versions_for(asked, lock)
-                found = _with_newest(asked, taken, found, one, tell)
-                return Resolution(found, one, tuple(guess.module for guess in taken))
+                versions, taken = versions_for(attempt, lock)
+                versions = _with_newest(attempt, taken, versions, candidate, tell)
+                return Resolution(versions, candidate, tuple(guess.module for guess in taken))
             except DependencyError as error:
                 if error.reason != "resolution":
                     raise
@@ -109,8 +111,8 @@ def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Te
                 if not resolve.is_about_python(error):
                     break
     cure = _cure(request, failed[0], first)
-    what = resolve.advice(request.python, list(dict.fromkeys(tried)), failed[0], cure)
-    raise DependencyError(f"{failed[0]}\n{what}", reason="resolution") from failed[0]
+    advice_text = resolve.advice(request.python, list(dict.fromkeys(tried)), failed[0], cure)
+    raise DependencyError(f"{failed[0]}\n{advice_text}", reason="resolution") from failed[0]
 
 
 def _with_newest(
@@ -162,10 +164,10 @@ def _cure(
 def _attempts(request: PackageRequest) -> Iterator[tuple[PackageRequest, Builder | None]]:
     """Yields requests and their builders; requests without guesses come last."""
     every = (*request.wanted, *(guess.wanted for guess in request.guesses))
-    wheels_alone = BUILDER is None or not any(one.requirement.url for one in every)
+    wheels_alone = BUILDER is None or not any(package.requirement.url for package in every)
     ways = [*([None] if wheels_alone else []), *([BUILDER] if BUILDER else [])]
     less = [replace(request, guesses=())] if request.guesses and request.wanted else []
-    return ((asked, builder) for asked in (request, *less) for builder in ways)
+    return ((attempt, builder) for attempt in (request, *less) for builder in ways)
 
 
 def _candidates(first: Interpreter, request: PackageRequest) -> Iterator[Interpreter]:
@@ -225,16 +227,16 @@ def _built_from_git(
 ) -> tuple[PackageRequest, list[str]]:
     """Replaces git repositories in a request by built wheels; returns also the wheels' folders."""
     wanted, wheels = [], []
-    for one in request.wanted:
-        source = of_git(one.requirement, one.where) if one.requirement.url else None
+    for package in request.wanted:
+        source = of_git(package.requirement, package.where) if package.requirement.url else None
         if source is None:
-            wanted.append(one)
+            wanted.append(package)
             continue
         [wheel] = builder([source], interpreter, tell)
         wheels.append(wheel)
-        extras = ",".join(sorted(one.requirement.extras))
+        extras = ",".join(sorted(package.requirement.extras))
         text = f"{source.name}[{extras}]=={parse_wheel_filename(wheel.name)[1]}"
-        wanted.append(parse_requirement(text, one.where))
+        wanted.append(parse_requirement(text, package.where))
     return replace(request, wanted=tuple(wanted)), _links(wheels)
 
 
@@ -248,10 +250,10 @@ def versions_for(
     if request.wanted or not taken:
         lock = resolved(request)
         names = {pin.partition("==")[0] for pin in lock.packages}
-        taken = tuple(one for one in request.guesses if not one.is_among(names))
+        taken = tuple(guess for guess in request.guesses if not guess.is_among(names))
         if not taken:
             return lock, ()
-    wanted = (*request.wanted, *(one.wanted for one in taken))
+    wanted = (*request.wanted, *(guess.wanted for guess in taken))
     return resolved(replace(request, wanted=wanted, guesses=())), taken
 
 
@@ -262,12 +264,12 @@ def root() -> Path:
 
 def key_of(request: PackageRequest, interpreter: Interpreter) -> str:
     """Hashes everything that a resolution depends on, including the sources of packages."""
-    asked = [
+    parts = [
         sorted(map(str, rows)) for rows in (request.wanted, request.constraints, request.override)
     ]
-    asked.append(sorted(str(one.wanted.requirement) for one in request.guesses))
+    parts.append(sorted(str(guess.wanted.requirement) for guess in request.guesses))
     rest = [request.without, request.exclude_newer, request.python, request.supports, request.gpu]
-    facts = [_FORMAT, WORKERS, asked, asdict(interpreter), rest, index.places()]
+    facts = [_FORMAT, WORKERS, parts, asdict(interpreter), rest, index.places()]
     return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
 
@@ -278,10 +280,10 @@ def recall(key: str) -> Resolution | None:
         lock = Lock(str(facts["lock"]), tuple(map(str, facts["options"])))
         interpreter = Interpreter(**facts["interpreter"])
         # each lock includes the worker's needs: an empty one is damaged
-        known = _stamp(interpreter) == facts["stamp"] and all(
+        is_fresh = _stamp(interpreter) == facts["stamp"] and all(
             os.sep not in option or os.path.isdir(option) for option in lock.options
         )
-        if lock.packages and known:
+        if lock.packages and is_fresh:
             return Resolution(lock, interpreter, tuple(map(str, facts["taken"])))
     except (OSError, ValueError, LookupError, TypeError):
         pass

@@ -212,19 +212,19 @@ def newer_sources(request: PackageRequest, lock: Lock, target: Target) -> list[S
     releases, where the lock has older ones since only those have wheels. Builds nothing.
     """
     chosen = dict(pin.split("==") for pin in lock.packages)
-    named = {canonicalize_name(one.requirement.name): one for one in request.wanted}
-    left = {name: one for name, one in named.items() if name in chosen and one.is_open}
+    named = {canonicalize_name(need.requirement.name): need for need in request.wanted}
+    left = {name: need for name, need in named.items() if name in chosen and need.is_open}
     while left:
-        asked = replace(request, wanted=tuple(left.values()), runs_worker=False)
+        newest = replace(request, wanted=tuple(left.values()), runs_worker=False)
         try:
-            sources = _sources(asked, target, sorted(left), ("--no-deps",))
-            newer = (one for one in sources if Version(one.version) > Version(chosen[one.name]))
+            sources = _sources(newest, target, sorted(left), ("--no-deps",))
+            newer = (pin for pin in sources if Version(pin.version) > Version(chosen[pin.name]))
             return list(newer)
         except DependencyError as error:  # uv names one package at a time
             without = left.keys() & set(_NO_SOURCES.findall(str(error)))
             if error.reason != "resolution" or not without:
                 return []
-            left = {name: one for name, one in left.items() if name not in without}
+            left = {name: need for name, need in left.items() if name not in without}
     return []
 
 
@@ -273,14 +273,14 @@ def _may_be_built(names: Iterable[str]) -> dict[str, str]:
 
 def _lines(wanted: Iterable[WantedPackage]) -> str:
     wanted = list(wanted)
-    for one in wanted:
-        if one.requirement.url is not None:
+    for need in wanted:
+        if need.requirement.url is not None:
             raise DependencyError(
-                f"{one.where} takes {one.requirement.name} from {one.requirement.url[:200]!r}, "
+                f"{need.where} takes {need.requirement.name} from {need.requirement.url[:200]!r}, "
                 "which is not built here; only packages of the index are installed",
                 reason="requirement",
             )
-    return "".join(f"{one.requirement}\n" for one in wanted)
+    return "".join(f"{need.requirement}\n" for need in wanted)
 
 
 def is_about_python(error: DependencyError) -> bool:
@@ -295,19 +295,19 @@ def without_wheels(error: DependencyError) -> list[str]:
 
 def _pins(text: str) -> list[tuple[str, str, list[str]]]:
     """Parses name, version and hashes of each package; refuses any other line."""
-    found: list[tuple[str, str, list[str]]] = []
+    pins: list[tuple[str, str, list[str]]] = []
     for line in text.splitlines():
         if pin := _PIN.fullmatch(line):
-            found.append((pin[1], pin[2], []))
-        elif (hashed := _HASH.fullmatch(line)) and found:
-            found[-1][2].append(hashed[1])
+            pins.append((pin[1], pin[2], []))
+        elif (hashed := _HASH.fullmatch(line)) and pins:
+            pins[-1][2].append(hashed[1])
         else:
             raise DependencyError(
                 f"uv returned {line[:200]!r}, which is not a pinned package with hashes: the index "
                 "must list the hashes of its packages",
                 reason="resolution",
             )
-    return found
+    return pins
 
 
 def _with_their_hashes(
@@ -315,17 +315,17 @@ def _with_their_hashes(
 ) -> str:
     """Returns the lock's text; each package keeps only the hashes that its requirement permits."""
     permitted: dict[str, tuple[set[str], str]] = {}
-    for asked in wanted:
-        if asked.hashes:
-            key = canonicalize_name(asked.requirement.name)
-            permitted.setdefault(key, (set(), asked.where))[0].update(asked.hashes)
+    for package in wanted:
+        if package.hashes:
+            key = canonicalize_name(package.requirement.name)
+            permitted.setdefault(key, (set(), package.where))[0].update(package.hashes)
     lines = []
     for name, version, hashes in pins:
-        among, where = permitted.get(canonicalize_name(name), (set(hashes), ""))
-        kept = [known for known in hashes if known in among]
+        among, origin = permitted.get(canonicalize_name(name), (set(hashes), ""))
+        kept = [digest for digest in hashes if digest in among]
         if not kept:
             raise DependencyError(
-                f"the index has {name}=={version}, but no file of it with a hash that {where} "
+                f"the index has {name}=={version}, but no file of it with a hash that {origin} "
                 "names. It was replaced there, or the hash is another file's",
                 reason="integrity",
             )
@@ -336,10 +336,10 @@ def _with_their_hashes(
 def _what_is_required(said: str, every: Sequence[WantedPackage]) -> str:
     """Lists the requirements that uv's explanation names, with the position of each."""
     words = {canonicalize_name(word) for word in re.findall(r"[A-Za-z0-9][A-Za-z0-9._-]*", said)}
-    named = [one for one in every if canonicalize_name(one.requirement.name) in words]
+    named = [need for need in every if canonicalize_name(need.requirement.name) in words]
     lines = [
-        f"  {one.requirement}  ({one.where}{_from_a_folder(one.requirement.name)})"
-        for one in (named or every)[:20]
+        f"  {need.requirement}  ({need.where}{_from_a_folder(need.requirement.name)})"
+        for need in (named or every)[:20]
     ]
     return "\n".join([REQUIRED, *lines])
 
@@ -353,14 +353,14 @@ def _from_a_folder(name: str) -> str:
 
 def cures(error: DependencyError) -> Iterator[dict[str, list[str]]]:
     """Yields keys of ``dependencies`` that may help, for the packages in uv's text."""
-    said = str(error).partition(REQUIRED)[0]
-    unknown = re.findall(rf"([A-Za-z0-9][A-Za-z0-9._-]*) was {_NOT_FOUND}", said)
-    unbuilt = re.match(r"([A-Za-z0-9][\w.-]*) \S+(?: \(.{0,300}?\))? has no wheel for", said)
+    message = str(error).partition(REQUIRED)[0]
+    unknown = re.findall(rf"([A-Za-z0-9][A-Za-z0-9._-]*) was {_NOT_FOUND}", message)
+    unbuilt = re.match(r"([A-Za-z0-9][\w.-]*) \S+(?: \(.{0,300}?\))? has no wheel for", message)
     if unbuilt is not None:
         yield {"override": [unbuilt[1]]}  # another version may have one
         unknown.append(unbuilt[1])
     yield from ({"without": [name]} for name in unknown)
-    words = Counter(name.lower() for name in _BOUNDED.findall(said))
+    words = Counter(name.lower() for name in _BOUNDED.findall(message))
     ours = {line.partition(">")[0]: line for line in WORKERS}
     for name, _ in words.most_common():
         yield {"override": [ours.get(name, name)]}
@@ -399,13 +399,13 @@ def without_cuda(
     """
     if request.gpu or not lock.has_cuda or os.environ.get("UV_TORCH_BACKEND"):
         return lock
-    for asked, options in _ways_without_cuda(request, lock):
+    for attempt, options in _ways_without_cuda(request, lock):
         try:
-            found = resolved(asked, options)
+            lock_without = resolved(attempt, options)
         except DependencyError:
             continue
-        if not found.has_cuda:
-            return found
+        if not lock_without.has_cuda:
+            return lock_without
     return lock
 
 

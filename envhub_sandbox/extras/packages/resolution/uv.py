@@ -120,17 +120,17 @@ def run(
     lines, done = list[str](), threading.Event()
     with (
         tempfile.TemporaryDirectory(prefix="envhub-uv-") as nowhere,
-        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as asked,
+        tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as stdin,
         tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as printed,
     ):
         # uv reads projects and settings in its working directory
         for name, text in files.items():
             Path(nowhere, name).write_text(text, "utf-8")
-        asked.write(given)
-        asked.seek(0)
+        stdin.write(given)
+        stdin.seek(0)
         process = subprocess.Popen(
             [command(), *arguments],
-            stdin=asked,
+            stdin=stdin,
             stdout=printed,
             stderr=subprocess.PIPE,
             cwd=nowhere,
@@ -200,21 +200,21 @@ def _listen(stream: IO[str], lines: list[str], tell: Tell, done: threading.Event
 
 def command() -> str:
     """Returns uv's path; ``DependencyError`` if uv is missing or too old."""
-    found: str | None
+    path: str | None
     try:
         from uv import find_uv_bin  # it knows pip's folder for uv, which may not be on PATH
 
-        found = str(find_uv_bin())
+        path = str(find_uv_bin())
     except (ImportError, FileNotFoundError):
-        found = shutil.which("uv")
-    if found is None:
+        path = shutil.which("uv")
+    if path is None:
         raise DependencyError(
             "uv, which resolves and installs packages, is neither installed in this interpreter "
             "nor on PATH. Run: pip install uv. Or use this interpreter's packages, with "
             f"{option_name('dependencies', 'host')}"
         )
-    _check_release(found)
-    return found
+    _check_release(path)
+    return path
 
 
 @lru_cache(maxsize=8)

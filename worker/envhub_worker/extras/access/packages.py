@@ -367,7 +367,7 @@ class Packages:
         order.program, order.result = None, (result, now)
         self._news.append((order.owner, now - since, result))
         self._orders.move_to_end(order_id)
-        finished = [known for known, other in self._orders.items() if other.result is not None]
+        finished = [name for name, other in self._orders.items() if other.result is not None]
         for oldest in finished[:-_REMEMBERED]:
             del self._orders[oldest]
 

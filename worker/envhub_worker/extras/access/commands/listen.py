@@ -86,10 +86,10 @@ def _serve(
     publish: Publish | None,
     around: Surroundings | None,
 ) -> int:
-    place = locked_folder.place_for_sockets()
-    locked_folder.remove_deserted(place)
+    parent = locked_folder.place_for_sockets()
+    locked_folder.remove_deserted(parent)
     with contextlib.ExitStack() as ends:
-        runtime = LockedFolder("envhub-", place)
+        runtime = LockedFolder("envhub-", parent)
         ends.callback(runtime.remove)
         ended = arguments.client_pidfd  # readable once that process has ended
         if arguments.until_eof:
@@ -189,13 +189,13 @@ def _gate(
     log: Log,
     publish: Publish | None,
 ) -> RemoteGate:
-    known = {} if identity.client is None else {identity.client.public: "the one client"}
+    clients = {} if identity.client is None else {identity.client.public: "the one client"}
     quotas = quotas_of(arguments)
     # only one client, if nothing keeps a jail from the files of other clients
     single = arguments.weakest_profile == "container" and landlock.version() < 1
     rules = Rules(
         keys=identity.keys,
-        authorized=AuthorizedClients(identity.authorized, known, 1 if single else None),
+        authorized=AuthorizedClients(identity.authorized, clients, 1 if single else None),
         operators=frozenset({identity.keys.public} if identity.keys else ()),
         quotas=quotas,
         permissions=Permissions(

@@ -138,23 +138,23 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_quotas(parser: argparse.ArgumentParser) -> None:
-    for field, (names, what, unit) in _QUOTAS.items():
+    for field, (names, meaning, unit) in _QUOTAS.items():
         default: int = getattr(Quotas(), field)
         shown, more = str(default), ""
         how: dict[str, Any] = {"type": _count}
         if unit:
             shown, more = size_text(default), f", as in 16G; in {unit} without a unit"
             how = {"type": partial(_size, unit), "metavar": "SIZE"}
-        text = f"for each key: {what}{more} (default: {shown})"
+        text = f"for each key: {meaning}{more} (default: {shown})"
         parser.add_argument(*names, default=default, help=text, **how)
 
 
 def quotas_of(arguments: argparse.Namespace) -> Quotas:
     """Returns the quotas that the options choose."""
-    given = vars(arguments)
+    values = vars(arguments)
     return Quotas(
         **{
-            field: given[names[0].lstrip("-").replace("-", "_")]
+            field: values[names[0].lstrip("-").replace("-", "_")]
             for field, (names, *_) in _QUOTAS.items()
         }
     )
