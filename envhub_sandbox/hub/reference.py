@@ -39,7 +39,7 @@ class _Scheme(NamedTuple):
     starts: tuple[str, ...]
 
     def function(self, name: str) -> Any:
-        """A function of the module. Raises ``SandboxUnavailableError``: it is not installed."""
+        """A function of its module. Raises ``SandboxUnavailableError``: that is not installed."""
         return extras.required(self.module, name, f"a reference of {self.kind}")
 
 

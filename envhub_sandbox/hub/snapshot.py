@@ -216,7 +216,7 @@ def _unavailable(
 
 
 def _in_store(candidates: Sequence[_Candidate], even_if_none: bool) -> str:
-    """A sentence about commits in the store that need no Hub, as references."""
+    """A sentence that lists the repository's commits in the store, which need no Hub."""
     ref = candidates[0].ref
     commits = [stored for candidate in candidates for stored in store.commits(candidate.folder)]
     others = [stored for stored in commits if stored.commit != ref.revision][:_SHOWN_COMMITS]

@@ -83,11 +83,11 @@ class LocalServer(WorkerServer):
     def __init__(self, prefix: str, sockets: str, stop_s: float) -> None:
         self._owner = OwnerProcess()
         self._stop_s = stop_s
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: subprocess.Popen[bytes] | None = None  # None before its start
         self.process_fd = -1
         self._runtime = RuntimeFolder(prefix)  # of mode 0700: the endpoint is ours alone
         self.stopped = False
-        self._sockets = [os.path.join(sockets, name) for name in ("server", "fds")]
+        self._sockets = [os.path.join(sockets, name) for name in ("server", "fds")]  # in the folder
         endpoint, self.fd_path = (f"{self.folder}/{name}" for name in self._sockets)
         self.endpoint = f"ipc://{endpoint}"
 
@@ -105,7 +105,7 @@ class LocalServer(WorkerServer):
     @contextlib.contextmanager
     def starting(self, start: Callable[[int], subprocess.Popen[bytes]]) -> Iterator[int]:
         """Start the process; yields the pipe on which it says that it is ready. A failure ends it.
-        ``start``: starts the process, which writes to the end of the pipe that it is given.
+        ``start``: starts the process; its argument is the end of the pipe for the process.
         """
         try:
             ready, ready_end = os.pipe()

@@ -86,7 +86,7 @@ class SharedJail(JailSource):
     def provide(self, loaded: LoadedJail) -> None:
         """Use a jail that is loaded already as the shared jail."""
         self._first = loaded
-        # interruption.md, rule 13; no environment may ever take the jail, nor close it
+        # interruption.md, rule 13; if no environment ever takes the jail, none closes it
         weakref.finalize(self, self.launcher.close, loaded).atexit = False
 
     def take(self, deadline: Deadline) -> LoadedJail:

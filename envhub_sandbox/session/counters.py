@@ -108,8 +108,8 @@ class FleetCounters(Counters):
     def __init__(self, parts: Sequence[Counters]) -> None:
         super().__init__()
         self._parts = parts
-        self._waited_ns = [0] * len(parts)
-        self._longest_ns = [0] * len(parts)
+        self._waited_ns = [0] * len(parts)  # by worker, over all steps
+        self._longest_ns = [0] * len(parts)  # likewise, of one step
 
     def waited(self, worker: int, elapsed_ns: int) -> None:
         """Add the time that a step waited for this worker, after earlier ones had answered."""

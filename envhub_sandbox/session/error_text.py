@@ -192,7 +192,7 @@ def add_reach_advice(error: EnvHubError, policy: Policy) -> bool:
 
 
 def _advice(text: str, policy: Policy, patterns: Collection[str] = ()) -> str:
-    """The sentence of the first row of advice that fits, of the rows in ``patterns`` if any."""
+    """The first advice that fits a text; ``patterns``: only consider rows with these patterns."""
     for pattern, granted, sentence in _ADVICE:
         applies = all(getattr(policy, name) in values for name, values in granted.items())
         if applies and pattern in (patterns or (pattern,)) and re.search(pattern, text):

@@ -155,7 +155,7 @@ class _HeldLock:
     """
 
     def __init__(self) -> None:
-        self._held: list[int] = []
+        self._held: list[int] = []  # the descriptor; empty once it is released
         _locks.add(self)
         # interruption.md, rule 5: also if a Ctrl-C has interrupted ``release``
         weakref.finalize(self, _close, self._held).atexit = False

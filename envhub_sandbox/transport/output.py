@@ -43,7 +43,7 @@ class Lines:
 
     def __init__(self, sinks: Sequence[Sink]) -> None:
         self._sinks = sinks
-        self._rest = b""
+        self._rest = b""  # the begin of a line whose end has not come yet
 
     def feed(self, data: bytes) -> None:
         """Take bytes; every complete line goes to the sinks."""
@@ -125,7 +125,7 @@ class OutputFollower:
         self, connect: Callable[[], WorkerConnection], jail: int, sinks: OutputSinks
     ) -> None:
         self._connect, self._jail, self._sinks = connect, jail, sinks
-        self._lines = Lines(sinks.sinks)
+        self._lines = Lines(sinks.sinks)  # joins lines over several answers
         self._offset = 0  # of the next byte to ask for, in all that the jail has printed
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="envhub-output", daemon=True)

@@ -206,7 +206,7 @@ class Results:
 
     def _restored(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         final = infos.get("final_obs") if self._restores else None
-        # a repository with its own vector environment may return any final_obs: leave others alone
+        # a repository's own vector class may return any final_obs: other forms stay as they are
         if type(final) is np.ndarray and final.dtype == object and final.ndim == 1:
             for index, member in enumerate(final):
                 final[index] = batches.restore(self._space, member)

@@ -41,9 +41,9 @@ class Loop:
         self._poller = zmq.Poller()
         self._callbacks: dict[Any, Callable[[], None]] = {}  # by descriptor or socket
         self._stopped = False
-        self._tick: Callable[[], None] = _nothing
-        self._look: Callable[[], int | None] = _nothing
-        self._failures = 0
+        self._tick: Callable[[], None] = _nothing  # called about once a second
+        self._look: Callable[[], int | None] = _nothing  # called before each wait
+        self._failures = 0  # of callbacks, in a row
 
     def tick(self, callback: Callable[[], None]) -> None:
         """Call a function about once a second, from now on."""

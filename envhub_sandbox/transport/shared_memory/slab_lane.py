@@ -145,7 +145,7 @@ class ColumnSteps(SlabLane):
         """
 
     def _rows(self, actions: Any) -> Iterable[list[Any]]:
-        """The leaves of the actions, for each shard its slice."""
+        """Each shard's slice of the leaves of the actions."""
         leaves = [actions] if self._flat_actions else slabs.flatten(self._action_space, actions)
         if len(self._bounds) == 1:
             return [leaves]
@@ -199,6 +199,6 @@ class ColumnSteps(SlabLane):
         return m.StepDone(observation, rewards, over, cut, info)
 
     def _observations(self) -> list[Any]:
-        """The observations, for each shard its rows."""
+        """Each shard's rows of the observations."""
         space = self.declared.manifest.single_observation_space
         return list(batches.split(space, self._batch.take(), self._bounds))

@@ -1,1 +1,1 @@
-"""Everything that shares a process with the stranger. Zygote and runners load it, by name."""
+"""The code that shares a process with the repository's; zygote and runners import it by name."""

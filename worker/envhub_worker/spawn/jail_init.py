@@ -229,7 +229,7 @@ class Init:
 
     def _note(self, request: notify.Request) -> None:
         """Report a denied attempt, each kind once; ignores attempts of a runner's self-test."""
-        # The runner may have reported a moment ago and run a stranger's code since.
+        # Its report may still wait in the channel although it runs a stranger's code by now.
         self._read_report(request.caller)
         runner = self._runners.get(request.caller)
         if runner is not None and runner.status is not None:

@@ -80,7 +80,7 @@ def main(argv: Sequence[str]) -> int:
     config = ZygoteConfig.from_wire(received[0])
     process.die_with_parent(config.parent, signal.SIGTERM)  # before anything that can take long
     try:
-        # Before this process imports a package of an interpreter that is not the server's.
+        # First: the packages of another interpreter than the server's are imported confined.
         common = zygote.enter(config)
     except LayerUnavailableError as error:
         refuse(channel, error)

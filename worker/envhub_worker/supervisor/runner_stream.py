@@ -47,7 +47,7 @@ class RunnerLink:
 
     @property
     def owed(self) -> list[Any]:
-        """The owners of unanswered requests, the oldest first, and that of a step last."""
+        """The owners of unanswered requests, the oldest first; a step in slabs comes last."""
         owners = list(self.pending.values())
         if self.slabs is not None and self.slabs.owner is not None:
             owners.append(self.slabs.owner)

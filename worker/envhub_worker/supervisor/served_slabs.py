@@ -157,8 +157,8 @@ class ServedSteps:
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
-        self._by_bell: dict[int, ServedSlabs] = {}
-        self._owed: dict[ServedSlabs, Callable[[], None]] = {}
+        self._by_bell: dict[int, ServedSlabs] = {}  # those whose rings are heard
+        self._owed: dict[ServedSlabs, Callable[[], None]] = {}  # with what takes the answer
 
     def fileno(self) -> int:
         """A descriptor that is readable when a runner has rung."""

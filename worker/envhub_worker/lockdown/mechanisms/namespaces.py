@@ -95,7 +95,7 @@ def _unshare(flags: int) -> None:
 def fork_in_new_pid_namespace() -> int:
     """``os.fork()`` whose child is the first process of a new pid namespace.
 
-    The zygote must own its own pid namespace: only then may it return to it.
+    The zygote must own its own pid namespace, or the kernel would not let it return there.
     """
     kernel.unshare(kernel.CLONE_NEWPID)
     pid = os.fork()

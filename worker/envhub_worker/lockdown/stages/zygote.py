@@ -139,11 +139,10 @@ def _mapped_folders() -> Iterable[str]:
 def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
     copied = [*plan.roots, *([config.packages] if config.packages else [])]
     enter_root = partial(mounts.enter_root, plan, config.place, copied, config.user)
-    # As root the private root is entered before the change of user, while folders like /root can
-    # still be crossed; that needs no user namespace. Then, or as a plain user first of all, comes
-    # the user namespace, which gives the right to the others. The fork makes us the first process
-    # of the new pid namespace; its /proc can be mounted only from inside, while the old one is in
-    # sight.
+    # In this order. Root enters the private root while it may still cross folders like /root, which
+    # needs no user namespace, and then changes its user. A plain user begins with the user
+    # namespace, which gives the right to all others. The fork makes us the first process of the new
+    # pid namespace; its /proc can be mounted only from inside, while the old one is in sight.
     try:
         if config.user is not None:
             kernel.unshare(kernel.CLONE_NEWNS)

@@ -455,7 +455,7 @@ def _build_tensor(payload: bytes, items: list[Any], tensors: Tensors) -> object:
 
 
 def tensor(array: Array, name: str, tensors: Tensors) -> object:
-    """Makes a tensor of the array of its bits; without a maker of tensors returns an array."""
+    """Makes a tensor from the array of its bits; returns an array if none can be made here."""
     if tensors is not None:
         return tensors(array, name)
     return widened_numpy(array) if name == "bfloat16" else array

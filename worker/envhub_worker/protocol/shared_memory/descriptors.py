@@ -70,7 +70,7 @@ class RunnerBell:
     def __init__(self) -> None:
         self._ours, self._theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._ours.shutdown(socket.SHUT_RD)
-        self._send = self._ours.send
+        self._send = self._ours.send  # looked up once: a ring is on the hot path
         self.theirs = self._theirs.fileno()
 
     def handed_over(self) -> None:
@@ -112,7 +112,7 @@ class Watch:
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
-        self._deaths: set[int] = set()
+        self._deaths: set[int] = set()  # pidfds, among all that is watched
 
     def bell(self, bell: OwnBell) -> None:
         """Watch a doorbell: each ring wakes ``wait``, and so does an earlier ring."""
