@@ -163,7 +163,7 @@ class LocalFolder:
         return (item for item in self._found() if isinstance(item, LocalFile))
 
     def listed(self, *, allow_secrets: bool = False) -> Listing:
-        """The files of the snapshot, within limits, and their records, by reading all of them.
+        """List and read the files of the snapshot, within limits; returns them with records.
         Raises ``SnapshotError``: they cannot be read; ``PolicyError``: it is a folder with keys, or
         a home.
         """

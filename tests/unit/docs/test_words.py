@@ -11,7 +11,7 @@ VAGUE = {
     *("asked", "found", "given", "here", "known", "made", "one", "place", "said", "there", "told"),
     *("what", "where", "which", "whole"),
 }
-MOST = 95
+MOST = 75
 
 
 def bound_names(module: ast.Module) -> list[str]:

@@ -420,8 +420,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             raise
 
     def forget_ends(self) -> None:
-        """Undo the note of ended episodes after a failed join, before which ``SyncVectorEnv`` would
-        not have noted them.
+        """Forget which episodes the last step ended, since its infos could not be joined:
+        ``SyncVectorEnv`` notes them only after that.
         """
         if self._sync:
             self._done = self._done_before

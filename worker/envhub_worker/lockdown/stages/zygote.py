@@ -35,11 +35,11 @@ def enter(config: ZygoteConfig) -> Common:
     Under ``strict`` it returns in a child of the calling process, which only waits for the child.
     Raises ``LayerUnavailableError``: the host lacks a layer that the profile names.
     """
-    # In this order: the root is planned while the host's files are still in sight. Under ``strict``
-    # the namespaces come next, with the change of user among them (see ``_enter_namespaces``);
-    # elsewhere that change alone, and only then can be tried what the new user may read. The
-    # skeleton of the packages is mounted before the first fork, so that all jails share it. The
-    # filters are compiled last, once, and installed by none but the runners: an init must mount.
+    # In this order. The root is planned while the host's files are still in sight. Under ``strict``
+    # the namespaces come next, and with them the change of user (``_enter_namespaces``). Elsewhere
+    # only the user changes, and what the new user may read is tried after that. The skeleton of the
+    # packages is mounted before the first fork, so that all jails share it. The filters are
+    # compiled last, once, and installed by none but the runners: an init must mount.
     if config.refusal is not None:
         raise LayerUnavailableError(**config.refusal)
     namespaced = config.profile == "strict"
