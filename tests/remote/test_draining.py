@@ -43,7 +43,7 @@ def test_what_runs_goes_on_and_nothing_new_comes_in(tmp_path: Path, repository: 
         with started(repository, sandbox=server.sandbox()) as env:
             server.process.terminate()
             assert draining(server)
-            with pytest.raises(ServerBusyError, match="the server drains") as caught:
+            with pytest.raises(ServerBusyError, match="takes no new work") as caught:
                 make_env(repository, n_envs=2, sandbox=server.sandbox())
             assert caught.value.quota == "draining"
             with peer(server, pair) as stranger:
