@@ -54,7 +54,7 @@ def test_many_descriptors_are_no_obstacle(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     folder = write_repository(tmp_path, STILL)
     stop_idle()  # a server of our own
-    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 1500), hard))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 4096), hard))
     files = [os.open(os.devnull, os.O_RDONLY) for _ in range(1100)]
     try:
         with make_env(folder) as suites:
