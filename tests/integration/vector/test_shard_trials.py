@@ -16,6 +16,14 @@ WAYS = [[(0, 2), (2, 4)], [(0, 3), (3, 4)], [(0, 4)]]
 STEPS = shard_trials.LEAST_STEPS
 
 
+@pytest.fixture(autouse=True)
+def three_ways(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    """A busy machine may lack the time to see that the sub-environments are independent."""
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path))
+    monkeypatch.setattr(shard_trials, "ways_to_cut", lambda count, cores: WAYS)
+    monkeypatch.setattr(shard_trials.ShardTrials, "may_share", lambda self, env: True)
+
+
 def use(lane: str, steps: int) -> tuple[list[tuple[int, int]], list[Any]]:
     """How it was cut, and all that it gave."""
     with make_env(sample("cartpole"), N_ENVS, use_async_envs=True, policy={"lane": lane}) as suites:
@@ -27,11 +35,9 @@ def use(lane: str, steps: int) -> tuple[list[tuple[int, int]], list[Any]]:
 
 @pytest.mark.parametrize("lane", ["auto", "frames"])
 def test_the_first_uses_try_all_ways_and_give_the_same(
-    lane: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Any
+    lane: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rows, seeds, order and infos; a use that is too short to be measured is repeated."""
-    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path))
-    monkeypatch.setattr(shard_trials, "ways_to_cut", lambda count, cores: WAYS)
     monkeypatch.setattr(shard_trials, "HOPELESS", float("inf"))
     assert use(lane, STEPS - 1)[0] == WAYS[0]
     uses = [use(lane, STEPS) for _ in WAYS]
@@ -41,10 +47,8 @@ def test_the_first_uses_try_all_ways_and_give_the_same(
     assert use(lane, 0)[0] in WAYS
 
 
-def test_what_is_never_closed_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+def test_what_is_never_closed_counts() -> None:
     """A training may be killed: after enough steps it is noted what they took."""
-    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path))
-    monkeypatch.setattr(shard_trials, "ways_to_cut", lambda count, cores: WAYS)
     with make_env(sample("cartpole"), N_ENVS, use_async_envs=True) as suites:
         suites.env.reset(seed=3)
         for left in range(shard_trials.ENOUGH_STEPS, 0, -1):
