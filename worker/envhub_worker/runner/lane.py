@@ -11,6 +11,7 @@ import contextlib
 import mmap
 import os
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from time import perf_counter_ns
 from typing import Any
 
@@ -251,13 +252,19 @@ class Lane:
     def _keep_to(self, cpu: int) -> None:
         self._cpu = cpu
         avoided, core = divmod(cpu, slabs.AVOIDED)
-        every = range(os.cpu_count() or 1)
+        others = own_cores() - {core - 1}
         with contextlib.suppress(OSError):  # it may have gone, or not be ours
-            os.sched_setaffinity(0, {core - 1} if core and not avoided else {*every} - {core - 1})
+            os.sched_setaffinity(0, {core - 1} if core and not avoided else others)
 
     def infos(self) -> dict[Any, Any]:
         """Returns the last step's infos, which did not fit into the slab."""
         return {}
+
+
+@lru_cache(maxsize=1)
+def own_cores() -> set[int]:
+    """The cores before a lane changed them: a user may have restricted them (``taskset``)."""
+    return os.sched_getaffinity(0)
 
 
 class ColumnLane(Lane):

@@ -14,7 +14,8 @@ from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.stream import StreamReader, pack_packet
 from envhub_worker.runner import runner
-from envhub_worker.runner.lane import Lane
+from envhub_worker.runner.described import raised
+from envhub_worker.runner.lane import Lane, own_cores
 from envhub_worker.runner.prefixes import Watches
 from tests.support.processes import eventually
 
@@ -38,18 +39,49 @@ class QuietLane:
         self.bell = -1
 
 
-def test_a_lane_that_is_closed_owes_nothing() -> None:
-    """Or a jail in which another environment lives would be taken for busy for ever."""
+@pytest.fixture
+def slab_lane() -> tuple[Lane, Any, Any]:
+    """A lane whose steps fail, and the words of its request and of its reply."""
     memory = [os.memfd_create(name) for name in ("request", "reply", "observations")]
     for fd in memory:
         os.ftruncate(fd, slabs.REPLY_BYTES)
-    request, reply = (mmap.mmap(fd, slabs.REPLY_BYTES) for fd in memory[:2])
+    request, reply = (slabs.words(mmap.mmap(fd, slabs.REPLY_BYTES)) for fd in memory[:2])
     bells = [os.memfd_create("bell") for _ in range(2)]
-    others: Any = [None] * 3
-    lane = Lane(m.Attach(1, 0, 0, 1), [*memory, *bells], *others, (), Watches())
-    slabs.words(request)[slabs.SEQUENCE] = 5
+    others: Any = [None, None, raised]
+    attach = m.Attach(1, 0, 0, 1)
+    return Lane(attach, [*memory, *bells], *others, (), Watches()), request, reply
+
+
+def test_a_lane_that_is_closed_owes_nothing(slab_lane: tuple[Lane, Any, Any]) -> None:
+    """Or a jail in which another environment lives would be taken for busy for ever."""
+    lane, request, reply = slab_lane
+    request[slabs.SEQUENCE] = 5
     lane.close()
-    assert slabs.words(reply)[slabs.SEQUENCE] == 5
+    assert reply[slabs.SEQUENCE] == 5
+
+
+def test_a_runner_stays_on_the_cores_that_its_user_gave_it(
+    slab_lane: tuple[Lane, Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As with ``taskset``: whatever core a lane avoids or keeps to, and back to any."""
+    cores, kept = {1, 2, 5}, []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(cores))
+
+    def keep(_: int, chosen: set[int]) -> None:
+        cores.intersection_update(chosen)
+        kept.append(set(chosen))
+
+    monkeypatch.setattr(os, "sched_setaffinity", keep)
+    own_cores.cache_clear()
+    lane, request, _ = slab_lane
+    for word in (slabs.AVOIDED + 1 + 2, 1 + 5, 0):
+        request[slabs.CPU] = word
+        request[slabs.CHANGES] += 1
+        request[slabs.SEQUENCE] += 1
+        assert lane.serve()
+    own_cores.cache_clear()
+    lane.close()
+    assert kept == [{1, 5}, {5}, {1, 2, 5}]
 
 
 def test_a_client_may_close_one_lane_and_then_another(monkeypatch: pytest.MonkeyPatch) -> None:
