@@ -11,7 +11,7 @@ import pytest
 from envhub_sandbox.errors import LoadError
 from envhub_sandbox.extras.packages import interpreters
 from envhub_sandbox.extras.packages.builds import wheels
-from envhub_sandbox.factory.build_env import mend
+from envhub_sandbox.extras.wheel_builder.entry import mend
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.session.builder import Builder, JailSource

@@ -80,6 +80,7 @@ MAY_IMPORT = {
     "envhub_sandbox.extras.remote": {"cli", "extras.packages", "hub", "sandboxes", "transport"},
     "envhub_sandbox.extras.sources": {"hub"},
     "envhub_sandbox.extras.starter": {"cli"},
+    "envhub_sandbox.extras.wheel_builder": {"factory", "hub", "sandboxes", "session"},
     "envhub_worker.__main__": {"find_extra", "server"},
     "envhub_worker.server": {"", "lockdown", "loop", "spawn", "supervisor"},
     "envhub_worker.supervisor": {"lockdown", "loop", "spawn"},

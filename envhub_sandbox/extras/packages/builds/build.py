@@ -1,6 +1,6 @@
 """Turns sources into wheels: fetches, unpacks, builds in a jail, checks, keeps.
 
-Our program ``factory/builder.py`` starts the jail, since this package does not depend on sandboxes.
+``extras.wheel_builder`` starts the jail, since this package does not depend on sandboxes.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from envhub_worker.protocol.text import printable
 PROFILE_VARIABLE = "ENVHUB_BUILD_PROFILE"
 WALL_S = 1800.0
 LIMITS = {"memory_bytes": "8G", "disk_bytes": "6G", "disk_files": 400_000, "cpu_time_s": 7200}
-_PROGRAM = "envhub_sandbox.factory.builder"
+_PROGRAM = "envhub_sandbox.extras.wheel_builder"
 _SHOWN = 6000
 _AROUND_S = 900.0
 _MOST_REQUIRED = 200
@@ -48,7 +48,7 @@ class BuildFailedError(DependencyError):
 def _in_jail(order: Mapping[str, Any], folder: Path) -> Path | tuple[str, ...]:
     """Returns a wheel below an empty folder, or the further requirements of the build backend.
 
-    Trust: both are a stranger's, unchecked. ``factory/builder.py`` reads the order; this function
+    Trust: both are a stranger's, unchecked. ``extras.wheel_builder`` reads the order; this function
     adds limits, profile and readable folders. Raises ``BuildFailedError``, or ``DependencyError``
     where this host cannot start a jail.
     """

@@ -1,4 +1,4 @@
-"""Has a jail build a wheel: ``python -I -m envhub_sandbox.factory.builder FOLDER``.
+"""Has a jail build a wheel: ``python -I -m envhub_sandbox.extras.wheel_builder FOLDER``.
 
 ``extras.packages.builds`` starts it, since packages know no sandboxes. The folder has the sources
 and ``order.json``. The result is printed as JSON: ``wheel``, the name of the file in ``wheel/``;
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerTimeoutError
-from envhub_sandbox.factory import build_env
+from envhub_sandbox.extras.wheel_builder import entry as build_entry
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.sandboxes.process import PROCESS
@@ -86,7 +86,7 @@ def _received(env: Any, reply: Mapping[str, Any], target: Path, most: int) -> di
 def _repository(folder: Path, order: Mapping[str, Any]) -> Repository:
     entry = folder / "repository"
     entry.mkdir()
-    shutil.copyfile(build_env.__file__, entry / "env.py")
+    shutil.copyfile(build_entry.__file__, entry / "env.py")
     limits = Limits(**order["limits"])
     wall_s = float(order["wall_s"])
     policy = Policy(
