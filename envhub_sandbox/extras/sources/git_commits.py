@@ -68,7 +68,12 @@ _SETTINGS = (
 _LIMITED = 'ulimit -f "$1" && ulimit -v "$2" && shift 2 && exec "$@"'
 """The first commands of ``sh``: git's children inherit the limits. Windows has none."""
 _MEMORY_KIB = 4 * 2**20
-_ALONE = {"GIT_TERMINAL_PROMPT": "0", "GIT_NO_LAZY_FETCH": "1", "GIT_CEILING_DIRECTORIES": "/"}
+_ALONE = {
+    "GIT_TERMINAL_PROMPT": "0",
+    "GIT_NO_LAZY_FETCH": "1",
+    "GIT_CEILING_DIRECTORIES": "/",
+    "TZ": "UTC0",
+}
 
 
 Variables = Mapping[str, str]
@@ -185,7 +190,9 @@ def day_of(url: str, commit: str) -> str:
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as folder:
         git = _Git(Path(folder), None, DAY_S)
         git.fetch(_checked(url), commit, "--filter=tree:0")  # without files, where a host can
-        return git.run("log", "-1", "--no-patch", "--format=%cs", commit).decode().strip()
+        # in UTC, as _ALONE says: an index dates its files so
+        words = ("log", "-1", "--no-patch", "--date=format-local:%Y-%m-%d", "--format=%cd", commit)
+        return git.run(*words).decode().strip()
 
 
 def _rows(file: IO[bytes], title: str) -> Iterator[bytes]:

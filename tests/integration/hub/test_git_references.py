@@ -96,7 +96,7 @@ def test_a_pin_that_is_there_asks_nobody(repository: Path, tmp_path: Path) -> No
         ref = f"git+{where}/org/repo"
         first = snapshot_named(f"{ref}@main:envs/env.py")
         assert first.commit == git(repository, "rev-parse", "main")
-        assert written(first) == "2026-01-01"  # by the commit, without its files
+        assert written(first) == "2026-01-01"  # by the commit, in UTC, without its files
     assert written(first) == "2026-01-01"
     assert snapshot_named(f"{ref}@{first.commit}:envs/env.py") == first
     with pytest.raises(RepositoryUnavailableError, match="ls-remote failed") as caught:

@@ -18,7 +18,7 @@ _OURS = {
         for what, value in (
             ("NAME", "Test"),
             ("EMAIL", "test@example.org"),
-            ("DATE", "2026-01-01T00:00:00Z"),
+            ("DATE", "2026-01-02T00:30:00+02:00"),
         )
     },
 }
