@@ -23,7 +23,7 @@ _KEPT = re.compile(
     r"|(?i:http_proxy|https_proxy|all_proxy|no_proxy)"
     r"|UV_(DEFAULT_INDEX|INDEX|INDEX_URL|EXTRA_INDEX_URL|FIND_LINKS|NO_INDEX|INDEX_STRATEGY"
     r"|INDEX_[A-Z0-9_]+_(USERNAME|PASSWORD)|KEYRING_PROVIDER|INSECURE_HOST|NATIVE_TLS|SYSTEM_CERTS"
-    r"|CACHE_DIR|OFFLINE|HTTP_TIMEOUT|HTTP_RETRIES|REQUEST_TIMEOUT"
+    r"|CACHE_DIR|OFFLINE|HTTP_TIMEOUT|HTTP_CONNECT_TIMEOUT|HTTP_RETRIES|REQUEST_TIMEOUT"
     r"|CONCURRENT_(DOWNLOADS|INSTALLS)|EXCLUDE_NEWER|TORCH_BACKEND"
     r"|PYTHON_INSTALL_DIR|PYTHON_INSTALL_MIRROR|PYTHON_DOWNLOADS_JSON_URL)"
 )
@@ -35,6 +35,8 @@ _PATHS = (
     *("UV_CACHE_DIR", "SSL_CERT_FILE", "SSL_CERT_DIR", "SSL_CLIENT_CERT", "REQUESTS_CA_BUNDLE"),
     "NETRC",
 )
+_DEFAULTS = {"UV_HTTP_CONNECT_TIMEOUT": "5"}
+"""uv tries four times: an index that cannot be reached is an error after half a minute."""
 _FIXED = {"UV_PYTHON_DOWNLOADS": "never", "UV_NO_PROGRESS": "1", "NO_COLOR": "1"}
 _YES = ("1", "true", "yes", "on")
 
@@ -46,7 +48,7 @@ def environment(variables: Mapping[str, str] | None = None) -> dict[str, str]:
     if not any(name in kept for name in _CHOOSE_AN_INDEX):
         kept |= _as_uv_says(pip_settings(env), kept)
     ours = {name: _from_here(name, value) for name, value in kept.items()}
-    return own_variables() | ours | _FIXED
+    return own_variables() | _DEFAULTS | ours | _FIXED
 
 
 def _from_here(name: str, value: str) -> str:

@@ -117,6 +117,7 @@ def resolve(
     options: Sequence[str] = (),
     refresh: bool = False,
     tell: Tell = lambda line: None,
+    timeout_s: float = _RESOLVE_S,
 ) -> Lock:
     """Returns pins for a target; accepts only wheels and builds nothing.
 
@@ -125,7 +126,7 @@ def resolve(
     for a version whose files lack a required hash (``reason`` is then ``"integrity"``).
     """
     words = [*uv.NO_BUILDS, "--generate-hashes", *options, *(["--refresh"] if refresh else [])]
-    text = _compiled(request, target, words, tell)
+    text = _compiled(request, target, words, tell, timeout_s=timeout_s)
     return Lock(_with_their_hashes(_pins(text), request.wanted), tuple(options))
 
 
@@ -135,6 +136,7 @@ def _compiled(
     words: Sequence[str],
     tell: Tell,
     settings: Mapping[str, str] = {},
+    timeout_s: float = _RESOLVE_S,
 ) -> str:
     """Returns the output of ``uv pip compile``; raises as ``resolve``."""
     ours = WORKERS if request.runs_worker else ()
@@ -156,7 +158,7 @@ def _compiled(
         ],
         what=f"no versions of the packages could be chosen for {target}",
         given=_lines(every),
-        timeout_s=_RESOLVE_S,
+        timeout_s=timeout_s,
         files={**{name: files[option] for option, name in named.items()}, **settings},
     )
     try:

@@ -40,6 +40,7 @@ _VERSION_S = 60.0
 _SECRET = re.compile(r"(?<=://)[^/?#\s]*(?=@)|(?<=\?)[^\s?=]+=[^\s'\"`)]+")
 """Possible secrets in a URL; uv hides passwords except in queries and in malformed URLs."""
 _WATCH_S = 1.0
+SILENT_S = 10.0
 _CLEAN_S = 60.0
 CACHE_WAIT_S = 10.0
 """How long to wait for other users of uv's cache."""
@@ -147,7 +148,7 @@ def run(
                 listener.start()
                 if file_bytes is not None:
                     _limit_files(process, file_bytes)
-                _wait(process, timeout_s, watch)
+                _wait(process, timeout_s, watch, tell)
             except subprocess.TimeoutExpired:
                 text = f"{what}: uv was not done after {timeout_s:.0f} s"
                 raise DependencyError(text, reason="index") from None
@@ -176,16 +177,23 @@ def _limit_files(process: subprocess.Popen[str], largest: int) -> None:
         resource.prlimit(process.pid, resource.RLIMIT_CORE, (0, 0))
 
 
-def _wait(process: subprocess.Popen[str], timeout_s: float, watch: Callable[[], None]) -> None:
-    until = time.monotonic() + timeout_s
+def _wait(
+    process: subprocess.Popen[str], timeout_s: float, watch: Callable[[], None], tell: Tell
+) -> None:
+    begun = time.monotonic()
+    told = 0.0
     while True:
+        waited = time.monotonic() - begun
         try:
-            process.wait(min(_WATCH_S, max(until - time.monotonic(), 0)))
+            process.wait(min(_WATCH_S, max(timeout_s - waited, 0)))
             return
         except subprocess.TimeoutExpired:
-            if time.monotonic() >= until:
+            if waited >= timeout_s:
                 raise
             watch()
+            if waited - told >= SILENT_S:  # uv prints nothing while it waits for an index
+                told = waited
+                tell(f"uv is still at work after {waited:.0f} s; is the package index slow?")
 
 
 def _listen(stream: IO[str], lines: list[str], tell: Tell, done: threading.Event) -> None:
@@ -247,6 +255,7 @@ def _error(what: str, said: str) -> DependencyError:
 
 def _in_the_users_words(said: str) -> str:
     """Rewords uv's text: uv addresses the author of the requirements, but the user reads it."""
+    said = re.sub(r"^warning: .* is missing an upload date.*\n", "", said, flags=re.MULTILINE)
     plain = re.sub(r"\byour requirements are unsatisfiable", "nothing satisfies all of them", said)
     plain = re.sub(r"\b[Yy]ou require\b", "it is required that there be", plain)
     return re.sub(r"^hint: ", "  ", plain, flags=re.MULTILINE).strip()

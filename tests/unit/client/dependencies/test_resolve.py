@@ -218,6 +218,21 @@ def test_no_password_of_an_index_is_in_an_error(
     assert "hidden" not in f"{caught.value} {caplog.text}"
 
 
+def test_a_wait_for_an_index_is_told(index: Index, monkeypatch: pytest.MonkeyPatch) -> None:
+    """uv itself says nothing as long as the index does not answer."""
+    monkeypatch.setattr(uv, "SILENT_S", 0.0)
+    index.hold("/simple")
+    said: list[str] = []
+
+    def tell(line: str) -> None:
+        said.append(line)
+        index.let_go()
+
+    request = PackageRequest("x", (parse_requirement("numpy", "line 1"),))
+    assert module.resolve(request, HERE, tell=tell, timeout_s=60.0).packages
+    assert "uv is still at work" in said[0]
+
+
 def test_only_uploads_before_a_date(index: Index, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the repository's packages; the worker's may be as new as it needs them, and no newer. The
     day of a release is that of the newest, be it a source."""
