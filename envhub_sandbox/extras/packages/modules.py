@@ -38,6 +38,11 @@ _MOST_NOTED = 4
 _SHOWN = 20
 _LONGEST = 100
 _MISSING = r"No module named '([\w.]+)'"
+_REMOVED = {
+    **dict.fromkeys(("asynchat", "asyncore", "distutils", "imp", "smtpd"), "3.11"),
+    **dict.fromkeys(("cgi", "cgitb", "crypt", "imghdr", "pipes", "sndhdr", "telnetlib"), "3.12"),
+}
+"""Modules that Python itself had, and the last release that has them."""
 _WORKERS = {"cloudpickle", "gymnasium", "msgpack", "numpy", "farama_notifications"}
 """Modules that every jail has."""
 _GYMNASIUM = (
@@ -264,15 +269,24 @@ class MissingModule:
         return ""
 
     def _cure(self, module: str, says: DeclaredPackages | None) -> str:
-        from envhub_sandbox.extras.sources.parsing import of_module
+        from envhub_sandbox.extras.sources.parsing import has_row, of_module
 
         names = of_module(module)
-        path = _path_here(module.partition(".")[0], sys.path) if module else ""
+        top = module.partition(".")[0]
+        if python := _REMOVED.get(top):
+            older = option_name("dependencies", {"python": python, "fetch_python": True})
+            return f"Python {python} is the last that has {module}; {older} takes it"
+        if "." in module and not has_row(module):
+            return f"{top} is there, and has no {module}: only another release of it may have it"
+        path = _path_here(top, sys.path) if top else ""
         if path and not names:  # an index may have another package of that name
-            return self._local(module.partition(".")[0], path)
-        if "." in module and (not names or module.partition(".")[0] in _WORKERS):
-            return f"A package of another version has {module}"
-        name = next(iter(names), "NAME-OF-THE-PACKAGE")
+            return self._local(top, path)
+        cure = self._install(next(iter(names), "NAME-OF-THE-PACKAGE"), says)
+        if names or not module or self._where(module):
+            return cure
+        return f"An installed package imports {module}, and none is known that brings it. {cure}"
+
+    def _install(self, name: str, says: DeclaredPackages | None) -> str:
         extra = option_name("dependencies", {"extra": [name]})
         if self.place in ("docker", "remote"):
             return self._elsewhere(extra)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,12 +14,13 @@ from envhub_sandbox.extras.packages.modules import MissingModule, note_missing
 from envhub_sandbox.extras.packages.packages import (
     PackageSet,
     PackageTarget,
+    ThisMachine,
     check_locked_tasks,
     locked_packages,
     opened_lock,
     packages_for,
 )
-from envhub_sandbox.extras.packages.request import Choice, chosen
+from envhub_sandbox.extras.packages.request import Choice, chosen, request_of
 from envhub_sandbox.hub.snapshot import Snapshot
 
 if TYPE_CHECKING:
@@ -85,7 +87,25 @@ class RepositoryPackages:
             return ""
         from envhub_sandbox.extras.packages.locks import day
 
-        return day.of_its_day(snapshot, error)
+        if not isinstance(target, ThisMachine):
+            return day.of_its_day(snapshot, error)  # only it knows its index and interpreters
+        return day.of_its_day(snapshot, error, partial(self._resolves, snapshot))
+
+    def _resolves(self, snapshot: Snapshot, keys: Mapping[str, Any]) -> bool:
+        """Tells whether there are versions with further keys of ``dependencies``."""
+        from envhub_sandbox.extras.packages.resolution import resolutions
+
+        further, old = chosen(keys, None)[0], self.choice
+        choice = replace(
+            further,
+            extra=(*old.extra, *further.extra),
+            only=old.only,
+            without=old.without,
+            override=(*further.override, *old.override),
+            python=further.python or old.python,
+        )
+        request = request_of(snapshot, choice)
+        return request is not None and resolutions.has_versions(request)
 
     def check(
         self, manifest: Manifest, label: str, env_kwargs: Mapping[str, Any], config: object

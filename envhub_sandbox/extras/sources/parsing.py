@@ -272,6 +272,11 @@ def of_module(name: str) -> list[str]:
     return table.get(name, [])
 
 
+def has_row(name: str) -> bool:
+    """Tells whether the table of modules has a row of its own for a module."""
+    return name in _table()
+
+
 @cache
 def _table() -> dict[str, list[str]]:
     text = Path(__file__).with_name("modules.txt").read_text("utf-8")

@@ -8,10 +8,12 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from datetime import date, datetime, timedelta, timezone
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from envhub_sandbox.errors import (
     DependencyError,
@@ -37,34 +39,52 @@ _OUTDATED = re.compile(
 )
 _FRAME_FILE = r'(?m)^[ |+-]*File "?([^"\n]+)"?, line \d+'
 _BROKEN_BY = {
-    r"removed in the NumPy 2\.0 release": ("numpy<2", "2024-06-16"),
+    r"removed in the NumPy 2\.0 release": ("numpy<2", "3.12", "2024-06-16"),
     r"module 'numpy' has no attribute '(bool|complex|float|int|object|str)'": (
-        "numpy<1.24",
+        *("numpy<1.24", "3.11"),
         "2022-12-18",
     ),
 }
-"""Maps a pattern of an error to a requirement for an earlier release, and the day of the break."""
+"""Maps a pattern of an error to a requirement for an earlier release, the newest Python that this
+has wheels for, and the day of the break."""
+_MISSING_TOP = re.compile(r"^ModuleNotFoundError: No module named '\w+'")
 _RECENT = timedelta(days=30)
 _MOST_DATES, _MOST_TEXT = 4, 65_536
 
 
-def of_its_day(snapshot: Snapshot, error: EnvHubError) -> str:
+def of_its_day(
+    snapshot: Snapshot,
+    error: EnvHubError,
+    resolves: Callable[[Mapping[str, Any]], bool] = lambda keys: True,
+) -> str:
     """Returns advice for an error at a start that packages of the repository's day may cure; empty
-    for other errors, and for a repository of today.
+    for other errors, and for a repository of today. ``resolves`` tells whether there are versions
+    with keys of ``dependencies``: only such keys are named.
     """
     text, days = _said_at_start(error), days_for(snapshot, error)
-    for pattern, (requirement, broken) in _BROKEN_BY.items():
+    for pattern, (requirement, python, broken) in _BROKEN_BY.items():
         if re.search(pattern, text) and (not days or days[0] >= broken):
-            # not "override": then the other packages are chosen to fit the earlier release
-            older = option_name("dependencies", {"extra": [requirement]})
+            keys = next(filter(resolves, _earlier(requirement, python)), None)
+            if keys is None:
+                return f"A later release of a package has broken it, and {requirement} does not fit"
+            older = option_name("dependencies", keys)
             return f"A later release of a package has broken it; {older} takes an earlier one"
-    if not days:
+    day = next((day for day in days if resolves({"exclude_newer": day})), "")
+    if not day:
         return ""
-    old = option_name("dependencies", {"exclude_newer": days[0]})
+    old = option_name("dependencies", {"exclude_newer": day})
     return (
         f"It is of {days[0]}. If packages have changed since, {old} gives it those of that day; "
         "'envhub check' looks for a later day that does"
     )
+
+
+def _earlier(requirement: str, python: str) -> Iterator[dict[str, Any]]:
+    """Yields keys of ``dependencies`` that take an earlier release: the least change first."""
+    # "extra" first: then the other packages are chosen to fit the earlier release
+    ways: tuple[dict[str, Any], ...] = ({"extra": [requirement]}, {"override": [requirement]})
+    yield from ways
+    yield from ({**way, "python": python, "fetch_python": True} for way in ways)
 
 
 def settled(snapshot: Snapshot, choice: Choice) -> Choice:
@@ -113,6 +133,8 @@ def _may_be_outdated(error: EnvHubError) -> bool:
     remote = _remote(error)
     if not message or remote is None or isinstance(remote, (OSError, EOFError, MemoryError)):
         return False
+    if _MISSING_TOP.search(message):
+        return False  # an earlier release of another package brings no module
     raised_in = re.findall(_FRAME_FILE, remote.traceback)[-1:]
     return bool(_OUTDATED.search(message)) or any("/packages/" in file for file in raised_in)
 

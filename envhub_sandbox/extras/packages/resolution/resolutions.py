@@ -18,7 +18,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from packaging.utils import parse_wheel_filename
+from packaging.utils import canonicalize_name, parse_wheel_filename
 
 from envhub_sandbox.errors import DependencyError, EnvHubError
 from envhub_sandbox.extras.packages import interpreters
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 _FORMAT = 2
 _MOST_CURES = 6
+_CHECK_S = 60.0
 Builder = Callable[[Sequence[Source], Interpreter, Tell], Sequence[Path]]
 """Makes one wheel of each source, in the same order. Each wheel lies in a folder that holds only
 wheels, and stays there. Raises ``DependencyError``."""
@@ -141,6 +142,34 @@ def _with_newest(
             text = f"{old} is installed, the newest that has a wheel; {older} asks for it. {error}"
             warnings.warn(text, stacklevel=2)
     return lock
+
+
+def has_versions(request: PackageRequest) -> bool:
+    """Tells whether there are versions for a request; builds and fetches nothing. True if only the
+    build of a source, or an index, could tell.
+    """
+    asked = {
+        canonicalize_name(one.requirement.name) for one in (*request.wanted, *request.override)
+    }
+    for target in _targets(request):
+        try:
+            resolve.resolve(replace(request, guesses=()), target, timeout_s=_CHECK_S)
+            return True
+        except DependencyError as error:
+            unbuilt = set(resolve.without_wheels(error))
+            if error.reason != "resolution" or (unbuilt and asked.isdisjoint(unbuilt)):
+                return True
+    return False
+
+
+def _targets(request: PackageRequest) -> Iterator[Target]:
+    try:
+        first = interpreters.find(request.python, request.supports)
+    except DependencyError:
+        if request.fetch_python:
+            yield Target(version=request.python, machine=interpreters.own().machine)
+        return
+    yield from (Target(python=one.path) for one in _candidates(first, request))
 
 
 def _cure(

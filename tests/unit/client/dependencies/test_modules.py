@@ -1,6 +1,7 @@
 """What a repository imports and does not declare is installed for it, where it is known what."""
 
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.errors import DependencyError, PolicyError, load_error, remote_error
-from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages import interpreters, packages
 from envhub_sandbox.extras.packages.interpreters import Interpreter
 from envhub_sandbox.extras.packages.locks import day
 from envhub_sandbox.extras.packages.locks.day import of_its_day, written
@@ -24,6 +25,7 @@ from envhub_sandbox.extras.packages.request import (
 from envhub_sandbox.extras.packages.resolution import resolutions
 from envhub_sandbox.extras.packages.resolution import resolve as resolving
 from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target
+from envhub_sandbox.extras.packages.source import RepositoryPackages
 from envhub_sandbox.extras.sources import parsing
 from envhub_sandbox.hub.snapshot import Snapshot, local, snapshot_named
 from tests.hub.stub_hub import StubHub
@@ -128,8 +130,11 @@ def test_no_index_is_asked_for_the_name_of_a_module(index: Index, tmp_path: Path
     assert "env.py, line 1 imports nobody_knows_this" in said
     assert "{'extra': ['NAME-OF-THE-PACKAGE']}" in said
     for module, said in (
-        ("cv2.aruco", "{'extra': ['opencv-python-headless']}"),
-        ("numpy.exceptions", "A package of another version has numpy.exceptions"),
+        ("cv2", "{'extra': ['opencv-python-headless']}"),
+        ("google.protobuf", "{'extra': ['protobuf']}"),
+        ("numpy.nosuch", "numpy is there, and has no numpy.nosuch"),
+        ("cgi", "{'python': '3.12', 'fetch_python': True}"),
+        ("its_package_knows_this", "An installed package imports its_package_knows_this"),
     ):
         missing = MissingModule(found, "process", "auto", None, True)
         advice = missing.advice(f"No module named '{module}'")
@@ -178,6 +183,40 @@ def test_what_took_names_away_is_named(tmp_path: Path, monkeypatch: pytest.Monke
     assert dated in of_its_day(found, error)
     monkeypatch.setattr(day, "_of_files", lambda snapshot: "2024-02-30")
     assert of_its_day(found, error) == ""
+
+
+def test_only_what_has_versions_is_advised(
+    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An earlier release that fits; else in place of the pin; else in an earlier Python; else none,
+    as no earlier day is. What is named is had."""
+    monkeypatch.setattr(interpreters, "others", lambda declared, first: [])
+    other = "3.10" if sys.version_info[:2] != (3, 10) else "3.11"
+    earlier = {"text": ("numpy<1.24", other, "2022-12-18")}
+    monkeypatch.setattr(day, "_BROKEN_BY", earlier)
+    error = load_error("AttributeError", "it failed")
+    error.__cause__ = remote_error("AttributeError", "AttributeError", "text", "")
+    loose = snapshot(tmp_path / "loose", MAKE, requirements__txt="numpy\n")
+    pinned = snapshot(tmp_path / "pinned", MAKE, requirements__txt="numpy>=2\n")
+    source = RepositoryPackages(AUTO, None, None)
+    said = [source.of_its_day(loose, packages.HERE, error)]
+    for tag in (f"cp{other.replace('.', '')}-none-any", "py3-none-any"):
+        make_wheel(index.folder, "numpy", "1.23", tag=tag)
+        for found in (loose, pinned):
+            said.append(source.of_its_day(found, packages.HERE, error))
+    keys: list[dict[str, Any]] = [{"extra": ["numpy<1.24"]}, {"override": ["numpy<1.24"]}]
+    python = {"python": other, "fetch_python": True}
+    for text, named in zip(said, (None, keys[0] | python, keys[1] | python, *keys), strict=True):
+        assert ("numpy<1.24 does not fit" if named is None else f"dependencies={named}") in text
+    for found, choice in ((loose, keys[0]), (pinned, keys[1])):
+        made = packages_for(found, chosen(choice, None)[0])
+        assert made is not None
+        assert "numpy==1.23" in made.facts["packages"]
+    old = snapshot(tmp_path / "loose", MAKE, requirements__txt="numpy>99\n")
+    for path in Path(old.repo_id).iterdir():
+        os.utime(path, (1_600_000_000, 1_600_000_000))
+    error.__cause__ = remote_error("AttributeError", "AttributeError", "has been renamed", "")
+    assert source.of_its_day(old, packages.HERE, error) == ""
 
 
 def test_the_day_of_a_commit_is_asked_where_it_is_from(
