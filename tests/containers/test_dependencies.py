@@ -6,7 +6,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.extras.docker import packages
-from envhub_sandbox.extras.docker.engines import Engine, find_image
+from envhub_sandbox.extras.docker.engines import Engine
 from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 from envhub_sandbox.extras.packages import environments, interpreters
 from tests.containers.kit import IMAGE
@@ -37,7 +37,7 @@ def make_env(n_envs=1, use_async_envs=False):
 @pytest.fixture
 def fits(engine: Engine) -> None:
     """An image whose Python this machine has, with a glibc that is no older."""
-    theirs, _ = packages.image_packages(engine, find_image(engine, IMAGE))
+    theirs, _ = packages.image_packages(engine, IMAGE)
     ours = interpreters.own()
     same = ours.version.split(".")[:2] == theirs.version.split(".")[:2]
     if not same or ours.machine != theirs.machine:

@@ -71,8 +71,7 @@ class ImageTarget:
         self._image = image
 
     def _inside(self) -> tuple[Interpreter, dict[str, InstalledPackage]]:
-        engine = self._engine()
-        return image_packages(engine, find_image(engine, self._image))
+        return image_packages(self._engine(), self._image)
 
     def meets(self, request: PackageRequest) -> bool:
         """Whether the image has all requested packages; raises as ``image_packages``."""
@@ -91,27 +90,33 @@ class ImageTarget:
         return replace(packages, python="")
 
 
-@lru_cache(maxsize=16)
 def image_packages(engine: Engine, image: str) -> tuple[Interpreter, dict[str, InstalledPackage]]:
     """Return an image's interpreter and the packages for its jails. ``image``: its id or name.
     Raises ``SandboxUnavailableError``: this is not an image of envhub-worker.
     """
+    identity = find_image(engine, image)  # a name may mean another image later
     try:
-        answer = engine.run(
-            *("run", "--rm", "--no-healthcheck", "--network", "none", "--read-only"),
-            *("--cap-drop", "ALL", "--security-opt", "no-new-privileges", "--pull", "never"),
-            *(word for limit in own_limits(engine) for word in ("--ulimit", limit)),
-            *("--entrypoint", _INTERPRETER, image, "-I", "-S", "-c", _ASK),
-        )
-        implementation, version, machine, libc, there = json.loads(answer)
-        installed = {
-            str(name): InstalledPackage(str(version), tuple(map(str, requires)))
-            for name, (version, requires) in there.items()
-        }
+        return _asked(engine, identity)
     except (EngineError, ValueError, TypeError, AttributeError) as error:
         raise SandboxUnavailableError(
             f"{image!r} is not an image of envhub-worker: {error}"
         ) from error
+
+
+@lru_cache(maxsize=16)
+def _asked(engine: Engine, image: str) -> tuple[Interpreter, dict[str, InstalledPackage]]:
+    """Ask the image of an id; raises what a wrong answer raises."""
+    answer = engine.run(
+        *("run", "--rm", "--no-healthcheck", "--network", "none", "--read-only"),
+        *("--cap-drop", "ALL", "--security-opt", "no-new-privileges", "--pull", "never"),
+        *(word for limit in own_limits(engine) for word in ("--ulimit", limit)),
+        *("--entrypoint", _INTERPRETER, image, "-I", "-S", "-c", _ASK),
+    )
+    implementation, version, machine, libc, there = json.loads(answer)
+    installed = {
+        str(name): InstalledPackage(str(version), tuple(map(str, requires)))
+        for name, (version, requires) in there.items()
+    }
     facts = (str(implementation), release(str(version)), str(machine), str(libc))
     return Interpreter(_INTERPRETER, *facts), installed
 

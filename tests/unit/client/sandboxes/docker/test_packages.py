@@ -1,6 +1,8 @@
 """Packages for a container: whether the image has them, or this machine's fit; and images."""
 
+import json
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -47,12 +49,35 @@ def test_what_an_image_has_is_in_its_metadata(line: str, python: str, lacking: s
 
 def test_what_it_imports_is_in_the_image_or_made(monkeypatch: pytest.MonkeyPatch) -> None:
     """By the names of distributions: nothing of an image is imported to see."""
-    monkeypatch.setattr(packages, "find_image", lambda engine, image: image)
     monkeypatch.setattr(packages, "image_packages", lambda engine, image: (NEWER, THERE))
     target = packages.ImageTarget(lambda: None, "image")
     for brought_by, met in ((("absent", "wanted-one"), True), (("absent",), False)):
         guess = Guess("module", parse_requirement("absent", "env.py, line 1"), brought_by)
         assert target.meets(replace(declares(), guesses=(guess,))) == met
+
+
+def test_an_image_that_is_built_again_is_read_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its name is the same, its id is another; one of a known id is not started again."""
+    monkeypatch.setattr(packages, "own_limits", lambda engine: ())
+    started: list[str] = []
+
+    class Engine:
+        image_id, kind = "", "docker"
+
+        def run(self, *words: str) -> str:
+            if words[0] == "image":
+                return self.image_id
+            started.append(self.image_id)
+            return json.dumps(["cpython", f"3.1{self.image_id[-1]}.0", "x86_64", "2.36", {}])
+
+    engine: Any = Engine()
+    for engine.image_id, version in (
+        ("sha256:1", "3.11"),
+        ("sha256:1", "3.11"),
+        ("sha256:2", "3.12"),
+    ):
+        assert packages.target_of(engine, "name").version == version
+    assert started == ["sha256:1", "sha256:2"]
 
 
 def test_an_interpreter_of_its_kind_fits() -> None:
