@@ -293,6 +293,8 @@ def name_denied(error: WorkerDiedError) -> None:
         more = len(error.denied) - _NAMED_DENIALS
         named = [one_line(denial, _SHOWN) for denial in error.denied[:_NAMED_DENIALS]]
         text = f"Before that it was denied: {', '.join(named)}{f' and {more} more' * (more > 0)}"
+    elif error.signal == "SIGSYS":  # nothing records it: the kernel ends the process at once
+        text = "A jail ends 32-bit code so, and no policy permits it; or the code sent the signal"
     elif error.denied is None and error.signal not in (None, "SIGKILL"):
         recording = option_name("policy", {"record_denials": True})
         text = f"If something that it was denied is the reason, {recording} names it"

@@ -160,6 +160,7 @@ def test_denials_are_asked_for_where_the_server_can_know(
         (tuple(f"read /{n}" for n in range(11)), None, "read /7 and 3 more$"),
         ((), "SIGSEGV", "^it died$"),
         (None, "SIGSEGV", "record_denials"),
+        (None, "SIGSYS", "ends 32-bit code so, and no policy permits it; [^{]*$"),
         (None, None, "^it died$"),
     ],
 )
