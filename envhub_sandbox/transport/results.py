@@ -35,8 +35,7 @@ class Results:
         slices: The same as ``bounds``, counted from the first of these sub-environments.
         apart: Whether infos come apart, as each sub-environment returned them: under its index,
             and for an episode that began in the same step, under its index plus ``count``.
-        looks_inside: Whether the values of observations are checked or changed, and not only
-            their classes, dtypes and shapes.
+        restores: Whether members of the space lose their class on the wire, and get it back here.
         max_bytes: How much larger than their messages the workers' infos may be when joined.
     """
 
@@ -52,8 +51,7 @@ class Results:
         # Rows of our own batch.
         self.slices = [(start - first, stop - first) for start, stop in bounds]
         self.count = sum(self._sizes)
-        self._restores = batches.restores(self._space)
-        self.looks_inside = self._declared or self._restores
+        self.restores = batches.restores(self._space)
 
     def step(self, replies: list[m.StepDone], infos: dict[Any, Any] | None = None) -> StepResult:
         """The tuple that ``VectorEnv.step`` returns, with ``infos`` in it if given.
@@ -205,7 +203,7 @@ class Results:
         return own, scalars, reward
 
     def _restored(self, infos: dict[Any, Any]) -> dict[Any, Any]:
-        final = infos.get("final_obs") if self._restores else None
+        final = infos.get("final_obs") if self.restores else None
         # a repository's own vector class may return any final_obs: other forms stay as they are
         if type(final) is np.ndarray and final.dtype == object and final.ndim == 1:
             for index, member in enumerate(final):
@@ -238,7 +236,7 @@ class Results:
                         f"the worker sent an observation that is not a batch of {self._space}"
                     )
         joined = parts[0] if len(parts) == 1 else batches.join(self._space, parts)
-        if not (self._restores and batches.conforms(self._space, joined, self.count)):
+        if not (self.restores and batches.conforms(self._space, joined, self.count)):
             return joined
         return batches.restore_batch(self._space, joined)
 

@@ -8,12 +8,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cloudpickle
 import numpy as np
 import pytest
 
 from envhub_sandbox import errors, make_env
+from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
 from tests.attacks.client.lies import GROWTH, MIB, Canary, peak_growth
@@ -89,6 +91,23 @@ BOMBS: dict[str, list[Buffer]] = {
     "the server's own words": m.pack(m.JailOpened(1, (1,), ())),
 }
 PLACES = ("observation", "rewards", "info")
+_TEXTS = """
+from envhub_worker.runner.sync_envs import Batch
+
+class Words(Plain):
+    observation_space = gym.spaces.Text(5)
+
+    def reset(self, *, seed=None, options=None):
+        gym.Env.reset(self, seed=seed)
+        return "first", {}
+
+    def step(self, action):
+        forms = [honest, lambda batch: ("later",), lambda batch: ["later"] * 2]
+        Batch.observation = forms[action]
+        return "later", 0.0, False, False, {}
+
+honest = Batch.observation
+"""
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +179,25 @@ def test_bombs_from_a_jail_are_refused(liar: Any, what: str) -> None:
     _, server_grew = found[0]
     assert client_grew < GROWTH
     assert server_grew < GROWTH
+
+
+def test_an_observation_is_checked_once_its_form_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Later ones of a form that was checked are not checked again: a form has no other values."""
+    check = Mock(side_effect=Results.step)
+    monkeypatch.setattr(Results, "step", lambda *args: check(*args))
+    policy = {"restart": "on_reset", "restart_backoff_s": 0}
+    options: dict[str, Any] = {"num_workers": 1, "policy": policy}
+    with make_env(str(write_environment(tmp_path, _TEXTS)), 2, **options) as suites:
+        for lie in (1, 2):
+            suites.env.reset()
+            check.reset_mock()
+            for _ in range(30):
+                assert suites.env.step([0, 0])[0] == ("later", "later")
+            assert check.call_count < 10
+            with pytest.raises(errors.RemoteProtocolError, match="not a batch of Text"):
+                suites.env.step([lie, lie])
 
 
 @pytest.mark.parametrize("mode", ["twice", "other id", "exit"])
