@@ -298,7 +298,7 @@ class Jails:
         """Returns the asker's live jail of this number. Raises the reply if there is none."""
         entry = self._found(asker.session, number)
         if entry is None:
-            why = "it has been closed, or another task in it was given up, or the server is new"
+            why = "the server was restarted, or the jail was closed, or given up by a task in it"
             raise RefusedError("WorkerDiedError", f"there is no jail {number}: {why}")
         if entry.death is not None:
             raise AnsweredError(m.replace(entry.death, operation=operation))
