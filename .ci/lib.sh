@@ -72,10 +72,17 @@ permit_what_this_machine_lacks() {
   fi
 }
 
-# make_venv PYTHON FOLDER: a virtual environment with uv in it.
+# install_into FOLDER ARGUMENT...: into the virtual environment there, by the uv of all steps.
+install_into() {
+  local folder=$1
+  shift
+  "$CI_UV" pip install --quiet --python "$folder/bin/python" "$@"
+}
+
+# make_venv PYTHON FOLDER [ARGUMENT...]: a virtual environment, and what is installed there.
 make_venv() {
-  "$1" -m venv "$2"
-  "$2/bin/python" -m pip install --quiet --disable-pip-version-check uv
+  "$CI_UV" venv --quiet --python "$1" "$2"
+  [ $# = 2 ] || install_into "${@:2}"
 }
 
 # wheel: the wheel that the step "tests" built, or one built now.
@@ -83,9 +90,7 @@ wheel() {
   local found
   found=$(ls "$CI_WORK"/tests/dist/*.whl "$CI_WORK"/dist/*.whl 2>/dev/null | head -1) || true
   if [ -z "$found" ]; then
-    make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/build" >&2
-    "$CI_WORK/build/bin/uv" pip install --quiet --python "$CI_WORK/build/bin/python" build >&2
-    "$CI_WORK/build/bin/python" -m build --wheel --outdir "$CI_WORK/dist" . >&2
+    "$CI_UV" build --quiet --wheel --out-dir "$CI_WORK/dist" . >&2
     found=$(ls "$CI_WORK"/dist/*.whl)
   fi
   echo "$found"
@@ -98,12 +103,9 @@ smoke() {
   local name=$1 python=$2 built
   shift 2
   built=$(wheel)
-  make_venv "$python" "$CI_WORK/$name"
-  local install=("$CI_WORK/$name/bin/uv" pip install --quiet --compile-bytecode)
-  install+=(--python "$CI_WORK/$name/bin/python")
-  "${install[@]}" "$@" "$built"
-  "${install[@]}" --group test
-  "$CI_WORK/$name/bin/uv" pip list --python "$CI_WORK/$name/bin/python" --format freeze |
+  make_venv "$python" "$CI_WORK/$name" --compile-bytecode "$@" "$built"
+  install_into "$CI_WORK/$name" --compile-bytecode --group test
+  "$CI_UV" pip list --python "$CI_WORK/$name/bin/python" --format freeze |
     grep -E '^(gymnasium|numpy|huggingface-hub|msgpack|pyzmq|cloudpickle|typer|click)=='
   copy_tests "$CI_WORK/$name/checkout"
   (

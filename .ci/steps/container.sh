@@ -60,9 +60,7 @@ docker build --quiet --network host --build-arg "BASE_IMAGE=$base" --tag "$image
 docker image inspect --format 'the image has {{.Size}} bytes' "$image"
 
 # what runs and checks examples/deployment; Compose as a plugin of the engine's command
-make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/deployment"
-"$CI_WORK/deployment/bin/uv" pip install --quiet --python "$CI_WORK/deployment/bin/python" \
-  --group deployment
+make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/deployment" --group deployment
 export PATH=$PATH:$CI_WORK/deployment/bin DOCKER_CONFIG=$CI_WORK/docker-config
 mkdir -p "$DOCKER_CONFIG/cli-plugins"
 ln -sf "$CI_WORK"/deployment/lib/python*/site-packages/compose/docker-compose \
@@ -75,6 +73,6 @@ if [ -x "$CI_WORK/tests/venv/bin/python" ]; then
   with_summary container bash "$CI_AGAIN" "$CI_WORK/tests/venv/bin/python" -m pytest -n 2 --dist loadfile \
     --durations=20 tests/containers
 else
-  export ENVHUB_TEST_DIR=$CI_WORK/container ENVHUB_TEST_RUNNER="bash $CI_AGAIN"
+  export ENVHUB_TEST_DIR=$CI_WORK/container ENVHUB_TEST_UV=$CI_UV ENVHUB_TEST_RUNNER="bash $CI_AGAIN"
   with_summary container ./test -n 2 --dist loadfile --durations=20 tests/containers
 fi

@@ -2,14 +2,13 @@
 # nothing is called that is not there, on any path: of a client not even on macOS and Windows.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
-make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/lint"
+make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/lint" '.[video,metrics]' --group lint
 bin=$CI_WORK/lint/bin
-"$bin/uv" pip install --quiet --python "$bin/python" '.[video,metrics]' --group lint
-"$bin/uv" pip uninstall --quiet --python "$bin/python" envhub-sandbox
+"$CI_UV" pip uninstall --quiet --python "$bin/python" envhub-sandbox
 
 # the locks are what their command makes of pyproject.toml
 cp -R .ci/locks "$CI_WORK/locks"
-UV=$bin/uv .ci/lock.sh
+UV=$CI_UV .ci/lock.sh
 diff -r .ci/locks "$CI_WORK/locks"
 
 "$bin/ruff" check .

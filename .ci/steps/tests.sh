@@ -2,7 +2,7 @@
 # what the documents say; containers are another step.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
-export ENVHUB_CI=1 ENVHUB_TEST_DIR=$CI_WORK/tests
+export ENVHUB_CI=1 ENVHUB_TEST_DIR=$CI_WORK/tests ENVHUB_TEST_UV=$CI_UV
 # Root's jails run as another user. Debian's own interpreter is one that all users may read, which
 # the profiles without a private root need; root's pyenv lies below /root, closed to others.
 PYTHON=$(find_python 3.11 || command -v python3)
