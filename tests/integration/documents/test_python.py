@@ -76,6 +76,7 @@ def test_the_test_of_an_author_passes(tmp_path: Path) -> None:
     (repository / "env.py").write_text(_TAKES_A_SIZE)
     test.write_text(text)
     arguments = ["-p", "no:cacheprovider", "-c", os.devnull, "--rootdir", str(tmp_path)]
+    arguments += ["--confcutdir", str(tmp_path)]  # or it lists all folders above
     run(["-m", "pytest", *arguments, "--envhub-ref", str(repository), str(test)], tmp_path)
 
 

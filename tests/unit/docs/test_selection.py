@@ -35,8 +35,10 @@ class _Chosen:
 
 def _chosen(folder: Path, *options: str) -> set[str]:
     chosen = _Chosen()
-    apart = ["-c", os.devnull, f"--rootdir={folder}", "--import-mode=importlib"]
-    apart += ["-p", "no:cacheprovider", "-p", "no:faulthandler", "-p", selection.__name__]
+    # confcutdir: without it, each entry of the folders above is looked at
+    apart = ["-c", os.devnull, f"--rootdir={folder}", f"--confcutdir={folder}"]
+    apart += ["--import-mode=importlib", "-p", "no:cacheprovider", "-p", "no:faulthandler"]
+    apart += ["-p", selection.__name__]
     code = pytest.main([*apart, "--collect-only", "-q", *options, str(folder)], plugins=[chosen])
     assert code == pytest.ExitCode.OK
     return set(chosen.names)
