@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -38,7 +39,8 @@ def use(path: Path, times: Mapping[str, float], count: int = 16) -> str:
     env, trials = environment(count), ShardTrials(path)
     bounds = trials.bounds_for(env, None)
     name = "+".join(str(stop - start) for start, stop in bounds)
-    trials.note(env, bounds, times[name])
+    for early in (1.9, 1.0):  # the last note of a use counts
+        trials.note(env, bounds, early * times[name])
     return name
 
 
@@ -52,7 +54,7 @@ def use(path: Path, times: Mapping[str, float], count: int = 16) -> str:
     ],
 )
 def test_the_fastest_of_all_is_used(path: Path, times: dict[str, float], expected: str) -> None:
-    assert [use(path, times) for _ in range(3)] == list(times)
+    assert [use(path, times) for _ in range(6)] == 2 * list(times)
     assert {use(path, times) for _ in range(5)} == {expected}
 
 
@@ -60,31 +62,42 @@ def test_fewer_are_not_tried_if_half_is_slower(path: Path, monkeypatch: pytest.M
     """A use that is many times as slow would be a high price for what is known already."""
     cores(monkeypatch, 8)
     tried = ["1+1+1+1+1+1+1+1", "2+1+1+1+1+1+1", "2+2+2+2"]
-    times = dict(zip(tried, (16e-3, 32e-3, 32e-3), strict=True))
+    times = dict(zip(tried, (16e-3, 36e-3, 36e-3), strict=True))
     assert [use(path, times, 8) for _ in range(5)] == [*tried, tried[0], tried[0]]
 
 
-def test_another_load_lets_all_be_tried_again(path: Path) -> None:
-    """The way that is used has become slower: the others may be better now."""
-    quiet = {"8+8": 90e-6, "10+6": 80e-6, "16": 100e-6}
-    loaded = {"8+8": 400e-6, "10+6": 300e-6, "16": 130e-6}
-    for _ in range(4):
-        use(path, quiet)
-    assert [use(path, loaded) for _ in range(4)] == ["10+6", "8+8", "16", "16"]
-    assert use(path, quiet) == "16"  # 1.3 times: that may be noise
-    quick = {name: step_s / 2 for name, step_s in quiet.items()}
-    assert [use(path, quick) for _ in range(5)] == ["16", "8+8", "10+6", "10+6", "10+6"]
+WAYS = ("8+8", "10+6", "16")
+QUIET = (160e-6, 150e-6, 100e-6)
 
 
-def test_what_was_far_slower_is_not_tried_again(path: Path) -> None:
-    times = {"2+2": 1e-3, "3+1": 1.1e-3, "4": 1.9e-3}
-    assert [use(path, times, 4) for _ in range(4)] == ["2+2", "3+1", "4", "2+2"]
-    slower = {name: 2 * step_s for name, step_s in times.items()}
-    assert [use(path, slower, 4) for _ in range(4)] == ["2+2", "3+1", "2+2", "2+2"]
+@pytest.mark.parametrize(
+    ("phases", "least"),
+    [
+        ([QUIET], 0.88),
+        ([(100e-6, 108e-6, 150e-6)], 0.92),
+        ([QUIET, (320e-6, 300e-6, 200e-6)], 0.8),  # a load that slows all down alike
+        ([(100e-6, 110e-6, 120e-6), *3 * [(400e-6, 400e-6, 150e-6)]], 0.75),  # one that does not
+    ],
+)
+def test_most_uses_are_nearly_the_fastest_despite_noise(
+    path: Path, phases: list[tuple[float, ...]], least: float
+) -> None:
+    """A third of the uses takes up to twice as long as usual, and loads come and go."""
+    best = uses = 0
+    for seed in range(5):
+        path.unlink(missing_ok=True)
+        noise = Random(seed)
+        for number in range(64):
+            times = phases[number // 16 % len(phases)]
+            late = 1 + noise.random() if noise.random() < 1 / 3 else 1 + noise.random() / 20
+            name = use(path, {way: late * step_s for way, step_s in zip(WAYS, times, strict=True)})
+            best += times[WAYS.index(name)] <= 1.1 * min(times)
+            uses += 1
+    assert best >= least * uses
 
 
 def test_other_cores_are_another_machine(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for _ in range(3):
+    for _ in range(6):
         use(path, {"8+8": 2e-4, "10+6": 2e-4, "16": 1e-4})
     cores(monkeypatch, 4)
     assert len(ShardTrials(path).bounds_for(ENV, None)) == 4
@@ -120,8 +133,11 @@ def test_every_sub_environment_has_one_shard(count: int, cpus: int) -> None:
         b"[]",
         b"{",
         b"\xff",
-        *(json.dumps({'["", "0", 2]': times}).encode() for times in ([], {"8+8": "1"})),
-        *(json.dumps({'["", "0", 2]': {"8+8": one}}).encode() for one in (0.0, -1.0, 1e9, True)),
+        *(
+            json.dumps({'["", "0", 2]': notes}).encode()
+            for notes in ({"8+8": 1e-3}, [1], [["8+8"]])
+        ),
+        *(json.dumps({'["", "0", 2]': [["8+8", s]]}).encode() for s in (0.0, -1.0, 1e9, True, "1")),
     ],
 )
 def test_a_damaged_file_is_as_none(path: Path, content: bytes) -> None:
