@@ -197,7 +197,8 @@ class SandboxVecEnv(VecEnv):
         elif set(chosen) == set(range(self.num_envs)):
             self.vector.set_attr(attr_name, [value] * self.num_envs)
         else:
-            raise ValueError("the repository's vector class sets an attribute only in all at once")
+            who = "the repository's own vector class"
+            raise ValueError(f"{who} can set {attr_name!r} only in all at once: leave indices out")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: _Indices = None, **method_kwargs: Any

@@ -38,7 +38,7 @@ def install(**options: Any) -> None:
     if unknown:
         raise TypeError(f"there is no option {', '.join(unknown)}; there are {', '.join(names)}")
     if options.get("sandbox", "process") is None:
-        raise TypeError("sandbox is None: LeRobot runs code in this process without install()")
+        raise TypeError("sandbox is None: without install() LeRobot runs code in this process")
     factory = lerobot.envs.factory
     missing = [name for name in _HELPERS if not callable(getattr(factory, name, None))]
     if missing:

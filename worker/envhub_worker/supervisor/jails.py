@@ -165,7 +165,7 @@ class Jails:
                 "WorkerError",
                 f"your key has jails of {len(held)} kinds, which is the most. Jails of one kind "
                 "have the same packages, policy, and variables that Python reads when it starts: "
-                "close environments, or give more of them the same",
+                "close environments, or open new ones of a kind that is open already",
             )
 
     def _check_runners(self, more: int, present: int) -> None:
