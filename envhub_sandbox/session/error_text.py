@@ -174,6 +174,11 @@ _ADVICE: tuple[tuple[str, dict[str, tuple[str, ...]], str], ...] = (
 )
 """A pattern in an error's text, the policy's values that explain it, and the advice."""
 _TEXT_CHARS = 65_536
+_LACKS_ARGUMENTS = (
+    r"\bgymnasium/envs/registration\.py\", line \d+, in make\n *env = env_creator\([^\n]*\n"
+    r"(?:[ ~^]*\n)?TypeError: [^\n]{1,200} missing \d+ required [a-z -]{1,40}: ([^\n]{1,400})"
+)
+"""The last frame calls the environment itself; a frame below may be of a package that changed."""
 
 
 def add_reach_advice(error: EnvHubError, policy: Policy) -> bool:
@@ -184,6 +189,7 @@ def add_reach_advice(error: EnvHubError, policy: Policy) -> bool:
     advice = ""
     if isinstance(remote, RemoteEnvError):
         advice = _advice(f"{remote.type_name}: {remote.message}"[:_TEXT_CHARS], policy)
+        advice = advice or _lacking_arguments(remote.traceback[-_TEXT_CHARS:])
     elif isinstance(error, WorkerDiedError) and error.signal in ("SIGABRT", "SIGSEGV", None):
         advice = _advice(error.log_tail[-_TEXT_CHARS:], policy, (_DISPLAY,))
     if advice and not str(error).endswith(advice):
@@ -205,6 +211,17 @@ def _advice(text: str, policy: Policy, patterns: Collection[str] = ()) -> str:
                 variable=option_name("environment", ["NAME"]),
             )
     return ""
+
+
+def _lacking_arguments(traceback: str) -> str:
+    """Advice if ``gymnasium.make`` lacks arguments for an environment; else empty."""
+    if (lacks := re.search(_LACKS_ARGUMENTS, traceback)) is None:
+        return ""
+    values = dict.fromkeys(re.findall(r"'(\w{1,100})'", lacks[1]), "VALUE")
+    return (
+        "The environment does not start without arguments of its own: its author says which "
+        f"values they take; give them with {option_name('env_kwargs', values)}"
+    )
 
 
 def _to_install(text: str) -> list[str]:

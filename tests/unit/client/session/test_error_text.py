@@ -7,6 +7,7 @@ import re
 import sys
 from pathlib import Path
 
+import gymnasium
 import pytest
 
 from envhub_sandbox import errors
@@ -236,6 +237,25 @@ def test_each_failure_names_what_brings_it(kind: str, message: str, named: str) 
     assert advice.count("\n") == 1
     for fields in re.findall(r"policy=(\{.*\})", advice):
         Policy(**ast.literal_eval(fields))  # accepts what is advised
+
+
+@pytest.mark.parametrize(
+    ("creator", "named"),
+    [("make", "env_kwargs={'df': 'VALUE', 'window': 'VALUE'}"), ("lambda: make()", "")],
+    ids=["itself", "a function below, of a package that may have changed"],
+)
+def test_arguments_that_an_environment_lacks_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, creator: str, named: str
+) -> None:
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", {})
+    source = (
+        "import gymnasium\ndef make(df, window):\n    pass\n"
+        f"gymnasium.register('Lacking-v0', {creator})\ngymnasium.make('Lacking-v0')\n"
+    )
+    failure = a_failure(tmp_path, source)
+    error = raised(failure)
+    assert add_reach_advice(error, Policy()) == bool(named)
+    assert named in str(error)
 
 
 @pytest.mark.parametrize(
