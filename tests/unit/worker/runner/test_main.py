@@ -1,5 +1,6 @@
 """The loop of a runner: a stream of requests, and the doorbell of the lane that it serves."""
 
+import itertools
 import mmap
 import os
 import socket
@@ -58,6 +59,27 @@ def test_a_lane_that_is_closed_owes_nothing(slab_lane: tuple[Lane, Any, Any]) ->
     request[slabs.SEQUENCE] = 5
     lane.close()
     assert reply[slabs.SEQUENCE] == 5
+
+
+def test_a_client_that_is_always_quick_does_not_keep_its_runner_from_the_server(
+    slab_lane: tuple[Lane, Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or a close and a reset of another environment in this runner would wait for it."""
+    lane, request, reply = slab_lane
+    request[slabs.SPIN], request[slabs.CHANGES] = 10**9, 1
+    most, clock = 10_000, itertools.count(0, 10**8)
+
+    def now_and_ask_again() -> int:
+        request[slabs.SEQUENCE] = min(reply[slabs.SEQUENCE] + 1, most)
+        return next(clock)
+
+    monkeypatch.setattr("envhub_worker.runner.lane.perf_counter_ns", now_and_ask_again)
+    request[slabs.SEQUENCE] = 1
+    lane.wake(alone=True)
+    assert reply[slabs.SEQUENCE] < most
+    assert reply[slabs.PARKED]
+    assert lane.was_awake  # so that the runner looks again soon: its client may not have rung
+    lane.close()
 
 
 def test_a_runner_stays_on_the_cores_that_its_user_gave_it(
