@@ -68,7 +68,7 @@ def batch_of(space: gym.Space[Any], value: Any, count: int | None, name: str = "
 def _batch_of_arrays(
     space: gym.Space[Any], value: Any, count: int | None, name: str = "actions"
 ) -> Any:
-    array = value if type(value) is np.ndarray else _array(space, value, name)
+    array = value if type(value) is np.ndarray else array_of(space, value, name)
     shape = _shape(space, count)
     dtype = np.dtype(space.dtype)
     # an empty list says nothing about the kind of its numbers
@@ -239,10 +239,13 @@ def _kinds_for(space: gym.Space[Any]) -> frozenset[str]:
     return _NUMBERS if np.dtype(space.dtype).kind == "f" else _INTEGERS
 
 
-def _array(space: gym.Space[Any], value: Any, path: str) -> Any:
+def array_of(space: gym.Space[Any], value: Any, path: str) -> Any:
+    """Numbers as an array. Raises ``ActionError``: numpy makes none of them."""
     try:
         if hasattr(value, "detach"):  # a torch tensor, possibly on a device or with a gradient
             value = value.detach().cpu()
+            if str(value.dtype) == "torch.bfloat16":  # numpy does not have it
+                value = value.float()
         return np.asarray(value)
     except Exception as error:
         raise ActionError(f"{path}: {_named(value)} is not a batch for {space}: {error}") from error

@@ -20,6 +20,7 @@ from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array
 
 from envhub_sandbox.errors import ActionError
+from envhub_sandbox.vector.actions import array_of
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.sub_environment import metadata_of_one
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
@@ -307,21 +308,21 @@ class SingleEnv(gym.Env[Any, Any]):
         if type(action) in (bool, int, float):
             return [action]  # a Python number arrives as one
         if isinstance(space, _PLAIN):
-            array = np.asarray(action)
+            array = array_of(space, action, "action")
             if array.shape != space.shape:
                 raise ActionError(
                     f"action: expected {space.dtype} of shape {space.shape} for {space}, got "
                     f"{array.dtype} of shape {array.shape}"
                 )
-            return array[None]
+            return [action] if type(action) is list else array[None]
         return concatenate(space, [action], cast("Any", create_empty_array(space, 1)))
 
     def _first(self, batch: Any, scalars: Sequence[bool]) -> Any:
         """The only observation; ``scalars`` says which discrete members were Python numbers."""
         [first, *_] = batches.members(*self._observations, batch, 1)
-        if True not in scalars:
+        if type(first) is np.ndarray or self._apart is None:
             return first
-        return batches.with_integers(self._observations[0], first, iter(scalars))
+        return batches.as_returned(self._observations[0], first, iter(scalars))
 
     def _own(
         self, infos: dict[Any, Any]

@@ -86,10 +86,11 @@ import numpy as np
 class Told(gym.Env):
     """Infos that a vector environment would join, and attributes that matter."""
 
-    observation_space = gym.spaces.Dict(
-        a=gym.spaces.Discrete(100),
-        b=gym.spaces.Tuple([gym.spaces.Discrete(100), gym.spaces.Box(-1, 1, (2,))]),
-    )
+    observation_space = gym.spaces.Dict([
+        ("b", gym.spaces.Tuple([gym.spaces.Discrete(100), gym.spaces.Box(-1, 1, (2,))])),
+        ("a", gym.spaces.Discrete(100)),
+        ("height", gym.spaces.Box(-1, 1, ())),
+    ])
     action_space = gym.spaces.Discrete(4)
     gravity = 10
     shape = (1,)
@@ -105,7 +106,8 @@ class Told(gym.Env):
 
     def seen(self):
         step = self.steps
-        return {"a": step, "b": (np.int64(step), np.full(2, step / 10, np.float32))}
+        shown = np.int64(step), np.full(2, step / 10, np.float32)
+        return {"b": shown, "a": step, "height": np.array(step / 10, np.float32)}
 
     def step(self, action):
         self.steps += 1

@@ -78,6 +78,21 @@ def test_actions_and_observations_are_of_the_single_spaces(space: spaces.Space[A
         assert repr(observation) == repr(action) or np.array_equal(observation, action)
 
 
+class _Recording(_Echo):
+    """Notes the classes of its actions."""
+
+    def step(self, action: Any) -> Any:
+        return (*super().step(np.asarray(action))[:4], {"kind": type(action).__name__})
+
+
+def test_a_list_of_numbers_arrives_as_one() -> None:
+    """As in a vector environment, whose action is a list of them."""
+    env = SingleEnv(SyncVectorEnv([lambda: _Recording(spaces.Box(-1, 1, (2,), np.float64))]))
+    env.reset()
+    actions = [0.5, 1.0], np.array([0.5, 1.0])
+    assert [env.step(action)[4]["kind"] for action in actions] == ["list", "ndarray"]
+
+
 class _Boasting(_Story):
     """Has an attribute that is the client's name for the sandbox."""
 

@@ -200,10 +200,15 @@ def integers(space: gym.Space[Any], member: Any) -> list[bool]:
     return list(itertools.chain.from_iterable(members))
 
 
-def with_integers(space: gym.Space[Any], member: Any, which: Iterator[bool]) -> Any:
-    """The inverse of ``integers``: makes the discrete parts that ``which`` marks Python ``int``."""
+def as_returned(space: gym.Space[Any], member: Any, which: Iterator[bool]) -> Any:
+    """A member of a batch as its environment returned it. The inverse of ``integers``: the discrete
+    parts that ``which`` marks are Python ``int``. Mappings have the space's order, which a batch of
+    them may sort, and a Box without dimensions has arrays.
+    """
 
     def restored(space: gym.Space[Any], member: Any) -> Any:
+        if isinstance(space, spaces.Box):
+            return np.asarray(member)
         return int(member) if isinstance(space, spaces.Discrete) and next(which, False) else member
 
     return _mapped(restored, space, member)
