@@ -65,7 +65,7 @@ def seeds(value: object) -> Any:
     Raises ``RemoteProtocolError``: a seed is neither a number nor None.
     """
     for seed in value if type(value) is tuple else (value,):
-        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer))):
+        if seed is not None and not isinstance(seed, (int, np.integer)):
             raise RemoteProtocolError(f"the worker sent a {type(seed).__name__} for a seed")
     return value
 

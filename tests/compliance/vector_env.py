@@ -122,8 +122,9 @@ class VectorEnvCompliance:
 
     def test_generators_are_the_sub_environments(self, pair: Pair) -> None:
         """``np_random`` and ``np_random_seed`` are tuples, as SyncVectorEnv has them."""
-        pair.reset(seed=21)
-        assert_same(pair.reference.np_random_seed, pair.sandboxed.np_random_seed, "seeds")
+        for seed in ([True] * pair.num_envs, 21):
+            pair.reset(seed=seed)
+            assert_same(pair.reference.np_random_seed, pair.sandboxed.np_random_seed, "seeds")
         assert_same(pair.reference.np_random, pair.sandboxed.np_random, "generators")
 
     def test_step_in_two_halves(self, pair: Pair) -> None:
