@@ -386,9 +386,13 @@ def test_an_argument_that_gymnasium_refuses_is_refused(given: Any, tmp_path: Pat
 
 
 _PLAIN = '''
+from collections import namedtuple
+
 import gymnasium as gym
 import numpy as np
 import torch
+
+Fact = namedtuple("Fact", ["source", "step"])
 
 class Batch(gym.vector.VectorEnv):
     """Steps all at once; what it returns changes its form from step to step."""
@@ -431,7 +435,7 @@ class Batch(gym.vector.VectorEnv):
         infos = {
             "distance": np.arange(n) / (at + 1), "_distance": ~done,
             "log": {"loss": at / 3, "steps": at, "name": "run", "grad": torch.full((2,), at)},
-            "best": np.float32(at / 7), "own": [at % 2 == 0, (None, np.int16(at)), f"{at}"],
+            "best": np.float32(at / 7), "own": [at % 2 == 0, Fact(None, np.int16(at)), f"{at}"],
             "time": 0 if steady else np.datetime64(at, "ns"),
         }
         if at % 4 == 1:

@@ -290,6 +290,13 @@ def test_the_answer_to_a_step_is_copied_before_it_is_looked_at(
         assert answer.value.all()
 
 
+class Mirror(tuple):
+    """Says that it has its members in the opposite order."""
+
+    def __iter__(self) -> Iterator[int]:
+        return reversed(self[:])
+
+
 @pytest.mark.parametrize(
     ("scalars", "refusal"),
     [
@@ -332,8 +339,10 @@ def test_columns_of_a_step_are_numbers_and_texts_of_its_form(
     else:
         answer = shard.answer()
         attack(shard, f"os.pwrite(observations, bytes({SLOT}), 0)")
-        with pytest.raises(IrregularError):  # more costs more than it saves
-            StepColumns([[None] * 1024], SLOT)
+        # more costs more than it saves; what says that it has other members crosses as those
+        for value in ([None] * 1024, Mirror((1, 2))):
+            with pytest.raises(IrregularError):
+                StepColumns([value], SLOT)
         endless = struct.pack("QQ", slabs.COLUMNS, slabs.INFO_BYTES + 1)
         attack(shard, f"os.pwrite(reply, {endless!r}, {slabs.OUTCOME * 8})")
         with pytest.raises(RemoteProtocolError, match="impossible answer"):

@@ -31,7 +31,7 @@ from envhub_worker.runner.sync_envs import Pairs, SubEnvs
 _RING = (1).to_bytes(8, "little")
 _MOST_AWAKE = 256
 """Requests in a row of a client that is always quick, between two looks at the server's."""
-_SELDOM = 16
+_SELDOM = 64
 """Steps, at most, from one offer of columns that were of no use to the next."""
 
 

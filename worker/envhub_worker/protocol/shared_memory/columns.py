@@ -27,6 +27,7 @@ from envhub_worker.protocol.shared_memory.words import INFO_BYTES, LINE
 
 _MAX_PARTS = 1024
 _PLAIN = frozenset({float, int, bool, str})
+_AS_TUPLES = (tuple.__iter__, tuple.__len__)
 New = tuple[list[Any], list[Any]]
 """Scalars and arrays of new results, in the order of the columns."""
 _Take = Callable[[Any, New], None]
@@ -76,7 +77,9 @@ class StepColumns:
             return partial(_take_same, value), lambda scalars, found: value
         if kind is dict and not set(map(type, value)) - {str}:
             return self._members(kind, value.values(), list(value))
-        if kind is tuple or kind is list:
+        # A named tuple crosses as its members, unless it says that it has others.
+        named = issubclass(kind, tuple) and (kind.__iter__, kind.__len__) == _AS_TUPLES
+        if kind is list or named:
             return self._members(kind, value, len(value))
         return self._leaf(value)
 
