@@ -106,9 +106,17 @@ def test_many_small_packets_keep_nothing() -> None:
     assert held < 500_000
 
 
-def test_a_flood_of_small_packets_is_read_in_linear_work() -> None:
-    flood = head(1, 0) * 200_000
-    assert sum(1 for _ in StreamReader(LIMITS).feed(flood)) == 200_000
+@pytest.mark.parametrize("torn", [0, 10])
+def test_of_a_flood_of_small_packets_the_rest_is_not_copied(torn: int) -> None:
+    """For each of them that would be quadratic work; also where the first one comes in two."""
+    flood, reader = head(1, 0) * 10_000, StreamReader(LIMITS)
+    assert list(reader.feed(flood[:torn])) == []
+    rest = memoryview(flood)[torn:]
+    tracemalloc.start()
+    assert sum(1 for _ in reader.feed(rest)) == 10_000
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < len(flood) // 10
 
 
 def test_what_must_not_come_is_refused_before_there_is_memory_for_it() -> None:
