@@ -193,8 +193,8 @@ def far() -> Iterator[OtherHost]:
 def test_a_partition_moves_rows(rows: Path, far: OtherHost, stays: Listening, serve: Serve) -> None:
     """A cable is out: the heartbeat says so, and the rows come back here; there nothing remains."""
     bind = f"tcp://{far.address}:5555"
-    there = serve("there", "--idle-s", "20", bind=bind, prefix=far.prefix)
-    sandbox = [stays.sandbox(), there.sandbox(heartbeat_s=5.0)]
+    there = serve("there", "--idle-s", "10", bind=bind, prefix=far.prefix)
+    sandbox = [stays.sandbox(), there.sandbox(heartbeat_s=3.0)]
     options: dict[str, Any] = {"n_envs": 6, "policy": {"restart": "transparent"}}
     with started(rows, sandbox=sandbox, **options) as env:
         lost = _is_at(env, there)
