@@ -6,7 +6,7 @@ other runners continue. With another ``restart`` there is no ``Recovery``, and a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,7 +39,6 @@ _SETTERS = frozenset({"__setattr__", "set_wrapper_attr"})
 class Recovery:
     """Restarts the dead shards of one environment, in this order: fork new runners, build, set the
     remembered attributes, then repeat the request.
-    ``fresh``: the shards that were restarted in the last request.
     """
 
     def __init__(
@@ -57,7 +56,6 @@ class Recovery:
         self._settings: dict[Any, list[list[bytes]]] = {}  # by target: each shard's frames
         self._setting: tuple[Any, list[list[bytes]]] | None = None  # set by the pending request
         self._asked: Sequence[m.Message] = ()  # of the last request, for new runners to repeat
-        self.fresh: tuple[int, ...] = ()
 
     # --- requests --------------------------------------------------------------------------------
 
@@ -68,7 +66,7 @@ class Recovery:
     def sent(self, request: Request) -> None:
         """Remember the seeds and attributes of a request that was sent."""
         self._asked = messages = request.messages
-        self._setting, self.fresh = None, ()
+        self._setting = None
         for message, (start, _) in zip(messages, self._bounds, strict=True):
             if isinstance(message, m.Reset):
                 self._seeds.remember(message, start)
@@ -113,13 +111,6 @@ class Recovery:
         merged = self._revive(replies, deaths, "step")
         return [typed_reply(reply, m.StepDone) for reply in merged]
 
-    def mark(self, infos: dict[Any, Any]) -> dict[Any, Any]:
-        """Add marks for the restarted shards to the infos of the last request."""
-        if not self.fresh:
-            return infos
-        results = self._lease.results
-        return mark_revived(infos, results.count, [results.slices[index] for index in self.fresh])
-
     def _of_survivors(self, deaths: RunnersDiedError) -> list[m.Message | None]:
         """The replies of the living shards, and None for the dead.
         Raises ``RemoteEnvError``: a living shard raised; the next request handles the deaths.
@@ -138,8 +129,8 @@ class Recovery:
     ) -> list[m.Message]:
         """Restart the dead shards; returns the replies of all shards."""
         # LOSS moves the state from PENDING to REVIVING. From there REVIVAL moves to READY,
-        # a timeout or an interrupt to LATE, and any other error to DEAD. ``fresh``, the counters
-        # and the recorder are up to date before READY, from which the next request may start.
+        # a timeout or an interrupt to LATE, and any other error to DEAD. The counters and
+        # the recorder are up to date before READY, from which the next request may start.
         lifecycle, failures = self._lifecycle, self._failures
         lifecycle.moved(Event.LOSS)
         failures.keep_crash(deaths.first)
@@ -162,7 +153,6 @@ class Recovery:
             lifecycle.request = None
             raise
         lifecycle.request = None
-        self.fresh = tuple(fresh)
         self._counters.deaths += len(fresh)
         self._recorder.started()
         lifecycle.moved(Event.REVIVAL)
@@ -266,13 +256,9 @@ def revived_step(reply: m.StepDone, count: int) -> m.StepDone:
     )
 
 
-def mark_revived(
-    info: dict[Any, Any], count: int, bounds: Iterable[tuple[int, int]] | None = None
-) -> dict[Any, Any]:
-    """Infos that mark all sub-environments, or those within ``bounds``, as restarted."""
-    yes = np.zeros(count, np.bool_)
-    for start, stop in [(0, count)] if bounds is None else bounds:
-        yes[start:stop] = True
+def mark_revived(info: dict[Any, Any], count: int) -> dict[Any, Any]:
+    """The infos of a shard's ``count`` sub-environments, marked as restarted."""
+    yes = np.ones(count, np.bool_)
     return {**info, RESTARTED: yes, f"_{RESTARTED}": yes.copy()}
 
 

@@ -36,11 +36,10 @@ from envhub_sandbox.session.use_lock import FleetUse, UseLock
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline, deadline_of
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import RunnersDiedError
-from envhub_sandbox.transport.results import Results, StepResult, all_replies
+from envhub_sandbox.transport.results import Results, StepResult, all_replies, is_of_joining
 from envhub_sandbox.transport.shard_trials import ENOUGH_STEPS
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
-from envhub_worker.protocol.spaces import batches
 
 if TYPE_CHECKING:
     from envhub_sandbox.session.recovery import Recovery
@@ -221,12 +220,9 @@ class RequestOrder(ABC):
         if isinstance(error, WorkerDiedError):
             self.refuse_if_closed()
 
-    def note_answered(self, kind: object = None) -> None:
-        """Note that a request was answered, by messages of this ``kind``.
-
-        A reset counts as answered only after ``finish_reset``, which may fetch its infos.
-        """
-        if self.after_request is not None and kind is not m.ResetDone:
+    def note_answered(self) -> None:
+        """Note that a request was answered."""
+        if self.after_request is not None:
             self.after_request()
 
     def show_warnings(self) -> None:
@@ -268,11 +264,6 @@ class Requests(RequestOrder):
         if self.lifecycle.state is State.READY:
             self.lifecycle.on(Event.SUBMIT)
             self.lifecycle.on(Event.TIMEOUT)  # LATE without a request: a reset takes a new jail
-
-    @property
-    def came_back(self) -> bool:
-        """Whether processes were restarted during the last request."""
-        return self._recovery is not None and bool(self._recovery.fresh)
 
     # --- requests ------------------------------------------------------------------------------
 
@@ -383,7 +374,7 @@ class Requests(RequestOrder):
         except BaseException as error:
             self.explain(error)
             raise
-        self.note_answered(kind)
+        self.note_answered()
         self.show_warnings()
         return replies
 
@@ -410,20 +401,10 @@ class Requests(RequestOrder):
         with self._incoming():
             return self.results.one_each(operation, replies)
 
-    def finish_reset(
-        self, replies: list[m.ResetDone], timeout: float | Deadline | None
-    ) -> tuple[Any, dict[Any, Any]]:
+    def finish_reset(self, replies: list[m.ResetDone]) -> tuple[Any, dict[Any, Any]]:
         """Turn replies into the result of ``VectorEnv.reset``; raises as ``collect`` does."""
         with self._incoming():
-            try:
-                result = self.results.reset(replies)
-            except batches.Misfit:
-                infos = self._infos_apart(deadline_of(timeout))
-                if self._recovery is not None:
-                    infos = self._recovery.mark(infos)
-                result = self.results.reset(replies, infos)
-        self.note_answered()
-        return result
+            return self.results.reset(replies)
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -439,8 +420,6 @@ class Requests(RequestOrder):
             if lifecycle.state is not State.READY:
                 with self.use.hold("step"):
                     self._make_ready("step")
-            if self._recovery is not None:
-                self._recovery.fresh = ()
             try:
                 lane = self._lease.lane
                 assert lane is not None
@@ -513,50 +492,22 @@ class Requests(RequestOrder):
         return result
 
     def _mended(self, error: BaseException, deadline: Deadline) -> StepResult:
-        """The results of a step whose infos cannot be joined, or whose runners died."""
-        if isinstance(error, batches.Misfit):
-            return self._lane().result(self._infos_apart(deadline))
-        if not isinstance(error, RunnersDiedError):
-            raise error
-        if self._recovery is None:
-            raise self._failures.dead(error.first) from None
-        done = self._recovery.survive_step(error)
-        try:
-            return self.results.step(done)
-        except batches.Misfit:
-            infos = self._infos_apart(Deadline(self._timeouts.reset_s))
-            return self.results.step(done, self._recovery.mark(infos))
+        """The results of a step whose runners died, from others in their place."""
+        if isinstance(error, RunnersDiedError):
+            if self._recovery is None:
+                raise self._failures.dead(error.first) from None
+            return self.results.step(self._recovery.survive_step(error))
+        if is_of_joining(error):
+            self.forget_ends(deadline)
+        raise error
 
-    def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
-        """Fetch each sub-environment's last infos, since the shards' joined infos do not match."""
-        own = self.own_infos(deadline)
-        try:
-            return self.results.joined_own(own)
-        except RemoteEnvError:
-            self.own_infos(deadline, failed=True)
-            raise
-
-    def own_infos(self, deadline: Deadline, *, failed: bool = False) -> list[m.Value]:
-        """Fetch the last infos of each sub-environment as it returned them; one reply a shard.
-
-        ``failed`` tells the runners instead that these infos could not be joined.
+    def forget_ends(self, deadline: Deadline) -> None:
+        """After a step whose infos cannot be joined, have the runners forget which episodes ended:
+        ``SyncVectorEnv`` does not note them then.
         """
-        lane = self._lane()
-        with self._outgoing("step"):
-            lane.send_for_infos(failed=failed)
-        try:
-            replies = self._finish(lane.replies, deadline)
-        except RunnersDiedError as deaths:
-            self.lifecycle.answered()  # the next request handles the deaths
-            raise deaths.first from None
-        return all_replies(replies, m.Value)
-
-    def checked_own_infos(self, deadline: Deadline, *, failed: bool = False) -> list[m.Value]:
-        """``own_infos`` of one worker of several; gives up a worker that sends malformed infos."""
-        with self.use.judging("a request"):
-            replies = self.own_infos(deadline, failed=failed)
-            self.results.own_pairs(replies)
-            return replies
+        packed = self.pack("forget_ends", for_every_shard(m.ForgetEnds))
+        self.submit_packed("forget_ends", packed)
+        self.collect(deadline, m.Value)
 
     # --- states around sending and receiving -----------------------------------------------------
 

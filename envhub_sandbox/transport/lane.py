@@ -114,23 +114,18 @@ class Lane:
         self._answers = self.replies(deadline)
         self.elapsed_ns = perf_counter_ns() - asked_ns
 
-    def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-        """The tuple that ``VectorEnv.step`` returns, with ``infos`` in it if given.
+    def result(self) -> StepResult:
+        """The tuple that ``VectorEnv.step`` returns.
 
         Trust: input from the worker.
 
         Raises:
-            Misfit: The shards' infos cannot be joined; ``send_for_infos`` asks for other ones.
-            RemoteEnvError: The repository's code raised.
+            RemoteEnvError: The repository's code raised, or the infos cannot be joined.
             RemoteProtocolError: A runner broke the rules.
         """
         # not kept, so that the next batch can use the memory of one that the caller has dropped
         answers, self._answers = self._answers, []
-        try:
-            return self.declared.step(all_replies(answers, m.StepDone), infos)
-        except batches.Misfit:
-            self._answers = answers  # for the next call, which brings other infos
-            raise
+        return self.declared.step(all_replies(answers, m.StepDone))
 
     def send(self, request: Request) -> None:
         """Send each shard its message.
@@ -173,17 +168,6 @@ class Lane:
             self._sending = False
             raise
         self._sending = False
-
-    def send_for_infos(self, *, failed: bool = False) -> None:
-        """Ask for the last infos as each sub-environment returned them; ``replies`` has them.
-
-        With ``failed``, tell the runners that the step failed, since its infos cannot be joined.
-
-        Raises:
-            EnvHubError: Nothing was sent.
-        """
-        packed = [self.jail.pack(m.FetchInfosApart(self.number, failed))] * len(self.runners)
-        self.send_some("step", self.runners, packed)
 
     def replies(self, deadline: Deadline) -> list[Any]:
         """Every shard's reply to the request; raises as ``wait`` does."""

@@ -7,7 +7,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, remote_error
+from envhub_sandbox.errors import EnvHubError, RemoteEnvError, RemoteProtocolError, remote_error
+from envhub_sandbox.transport import infos as infos_of
 from envhub_sandbox.transport.replies import check_reply, typed_reply
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
@@ -16,10 +17,8 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces import batches
 
-_NOT_ONE_EACH = "the worker's infos are not one mapping each"
 _SHOWN = 500
 StepResult = tuple[Any, Any, Any, Any, dict[Any, Any]]
-OwnInfo = tuple[int, dict[Any, Any], batches.Forms]
 Own = tuple[list[list[dict[Any, Any]]], Sequence[bool], tuple[Any, ...]]
 """Infos of each sub-environment, which members are Python numbers, and an odd reward, if any."""
 
@@ -33,10 +32,10 @@ class Results:
         manifest, bounds: As given.
         count: The number of sub-environments: all, or those of one worker of several.
         slices: The same as ``bounds``, counted from the first of these sub-environments.
-        apart: Whether infos come apart, as each sub-environment returned them: under its index,
-            and for an episode that began in the same step, under its index plus ``count``.
+        apart: Whether infos are returned as each sub-environment returned them: ``own`` and
+            ``joined`` read these.
         restores: Whether members of the space lose their class on the wire, and get it back here.
-        max_bytes: How much larger than their messages the workers' infos may be when joined.
+        max_bytes: How much larger than their own the workers' infos may be when joined.
     """
 
     def __init__(self, manifest: EnvManifest, bounds: Sequence[tuple[int, int]]) -> None:
@@ -51,23 +50,21 @@ class Results:
         # Rows of our own batch.
         self.slices = [(start - first, stop - first) for start, stop in bounds]
         self.count = sum(self._sizes)
+        self._is_part = self._declared and self.count < manifest.num_envs
+        self._is_sliced = self._declared and self._sizes != [manifest.num_envs]
         self.restores = batches.restores(self._space)
 
-    def step(self, replies: list[m.StepDone], infos: dict[Any, Any] | None = None) -> StepResult:
-        """The tuple that ``VectorEnv.step`` returns, with ``infos`` in it if given.
-        Raises ``Misfit``: the shards' infos cannot be joined; ``joined_own`` can join others.
-        """
+    def step(self, replies: list[m.StepDone]) -> StepResult:
+        """The tuple that ``VectorEnv.step`` returns."""
         return (
             self._observation([reply.observation for reply in replies]),
             self._per_env("rewards", [reply.rewards for reply in replies]),
             self._per_env("terminations", [reply.terminations for reply in replies]),
             self._per_env("truncations", [reply.truncations for reply in replies]),
-            self.infos([reply.info for reply in replies]) if infos is None else infos,
+            self.infos([reply.info for reply in replies]),
         )
 
-    def joined_steps(
-        self, parts: Sequence[StepResult], infos: dict[Any, Any] | None = None
-    ) -> StepResult:
+    def joined_steps(self, parts: Sequence[StepResult]) -> StepResult:
         """Join several workers' checked results of a step; returns and raises as ``step``."""
         observations, rewards, terminations, truncations, own = zip(*parts, strict=True)
         if len({part.shape[1:] for part in rewards}) > 1:
@@ -77,130 +74,82 @@ class Results:
             np.concatenate(rewards),
             np.concatenate(terminations),
             np.concatenate(truncations),
-            self._joined_infos(own) if infos is None else infos,
+            self.infos(own),
         )
 
     def joined_resets(
-        self, parts: Sequence[tuple[Any, dict[Any, Any]]], infos: dict[Any, Any] | None = None
+        self, parts: Sequence[tuple[Any, dict[Any, Any]]]
     ) -> tuple[Any, dict[Any, Any]]:
         """Join several workers' results of a reset."""
         observations, own = zip(*parts, strict=True)
-        joined = self._joined_infos(own) if infos is None else infos
-        return batches.join(self._space, observations), joined
+        return batches.join(self._space, observations), self.infos(own)
 
-    def _joined_infos(self, own: Sequence[dict[Any, Any]]) -> dict[Any, Any]:
-        return (
-            self._beside(own)
-            if self.apart
-            else batches.join_infos(own, self._sizes, self.max_bytes)
-        )
-
-    def reset(
-        self, replies: list[m.ResetDone], infos: dict[Any, Any] | None = None
-    ) -> tuple[Any, dict[Any, Any]]:
-        """The tuple that ``VectorEnv.reset`` returns; ``infos`` as for ``step``."""
+    def reset(self, replies: list[m.ResetDone]) -> tuple[Any, dict[Any, Any]]:
+        """The tuple that ``VectorEnv.reset`` returns."""
         observation = self._observation([reply.observation for reply in replies])
-        if infos is None:
-            infos = self.infos([reply.info for reply in replies])
-        return observation, infos
+        return observation, self.infos([reply.info for reply in replies])
 
-    def joined_own(self, replies: list[m.Value]) -> dict[Any, Any]:
-        """Join the infos of all sub-environments, which came singly, as Gymnasium does.
+    def infos(self, parts: Sequence[dict[Any, Any]]) -> dict[Any, Any]:
+        """Join the shards' infos into one mapping, which is ``unjoined`` if others are to be joined
+        with it. Trust: input from the worker.
         Raises ``RemoteEnvError``: Gymnasium would raise, too.
         """
-        own = self.own_pairs(replies)
-        forms = [form for _, _, form in own]
-        return self._joined_pairs([(index, info) for index, info, _ in own], forms)
+        if not self._is_sliced:
+            return parts[0] if self.apart else self._restored(parts[0])
+        if not any(parts):
+            return {}
+        with UNTRUSTED:
+            columns, each = infos_of.read(parts, self._sizes)
+        if not self.unjoined:
+            return self._joined(columns, each)
+        return columns or (parts[0] if len(parts) == 1 else infos_of.unjoined(each))
 
-    def _joined_pairs(
-        self, pairs: batches.Pairs, forms: Sequence[batches.Forms] = ()
-    ) -> dict[Any, Any]:
-        most = DEFAULT_LIMITS.message_bytes
+    @property
+    def unjoined(self) -> bool:
+        """Whether infos are returned unjoined, to the caller or to be joined with others."""
+        return self.apart or self._is_part
+
+    def joined(self, infos: dict[Any, Any]) -> dict[Any, Any]:
+        """Infos as ``VectorEnv`` returns them, also if they are unjoined; raises as ``infos`` and
+        ``each``.
+        """
+        if not (self.unjoined and infos):
+            return infos
+        with UNTRUSTED:
+            columns, each = infos_of.read([infos], [self.count])
+        _refuse_reward(infos)
+        return self._joined(columns, each)
+
+    def _joined(self, columns: dict[Any, Any] | None, each: infos_of.OwnInfos) -> dict[Any, Any]:
+        if columns is not None:
+            return infos_of.without_classes(columns)
         try:
-            infos = batches.join_pairs(pairs, self.count, most, forms)
+            return self._restored(infos_of.joined(each, self.max_bytes))
         except FAULTS as error:
             if isinstance(error, (EnvHubError, MemoryError)):
                 raise
             name = type(error).__name__
             raise remote_error(name, name, one_line(str(error), _SHOWN)) from error
-        return self._restored(infos)
-
-    def own_pairs(self, replies: list[m.Value]) -> list[OwnInfo]:
-        """The infos of all sub-environments, each with its index and its forms.
-        Trust: input from the worker. Raises ``RemoteProtocolError``: the infos are malformed, or
-        the index of one is out of range.
-        """
-        pairs: list[OwnInfo] = []
-        start = 0
-        for reply, size in zip(replies, self._sizes, strict=True):
-            each = _own_infos(reply.value, size)
-            pairs += [(start + index, info, forms) for index, info, forms in each]
-            start += size
-        return pairs
-
-    def infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
-        """Join the shards' infos into one mapping."""
-        if len(parts) == 1:
-            return self._restored(parts[0])
-        if self.apart:
-            return self._beside(parts)
-        return self._restored(batches.join_infos(parts, self._sizes))
-
-    def _beside(self, parts: Sequence[dict[Any, Any]]) -> dict[Any, Any]:
-        """Join the shards' infos that came apart. Trust: input from the worker."""
-        own: dict[Any, Any] = {}
-        marks: list[dict[Any, Any]] = []
-        for part, (start, _), size in zip(parts, self.slices, self._sizes, strict=True):
-            marks.append({})
-            for key, value in part.items():
-                if type(key) is not int:
-                    marks[-1][key] = value
-                elif 0 <= key < 2 * size:
-                    own[start + key % size + key // size * self.count] = value
-        try:
-            return {**batches.join_infos(marks, self._sizes), **own}
-        except batches.Misfit as error:
-            raise RemoteProtocolError(_NOT_ONE_EACH) from error
-
-    def joined(self, infos: dict[Any, Any]) -> dict[Any, Any]:
-        """Infos as ``VectorEnv`` returns them, also if they came apart; raises as ``each``."""
-        if not self.apart:
-            return infos
-        pairs = [(at, pair) for at, some in enumerate(self.each(infos)) for pair in some]
-        return self._joined_pairs(pairs)
 
     def each(self, infos: dict[Any, Any]) -> list[list[dict[Any, Any]]]:
-        """Each sub-environment's infos, in order, from infos that came apart.
+        """Each sub-environment's infos, in order, from unjoined infos.
         Raises ``RemoteEnvError``: a reward is not a number.
         """
         with UNTRUSTED:
-            own, _, reward = self.own(infos)
-        if reward:
-            shown = one_line(batches.reward_misfit(reward[0], 0), _SHOWN)
-            raise remote_error("ValueError", "ValueError", shown)
+            own, *_ = self.own(infos)
+        _refuse_reward(infos)
         return own
 
     def own(self, infos: dict[Any, Any]) -> Own:
-        """Each sub-environment's infos, from infos that came apart. A single sub-environment also
-        has marks of which members of its observation are Python numbers, and a reward that is not
-        a number. Trust: input from the worker.
+        """Each sub-environment's infos, from unjoined infos. A single sub-environment also has
+        marks of which members of its observation are Python numbers, and a reward that is not a
+        number. Trust: input from the worker.
         """
-        places = sorted(key for key in infos if type(key) is int and key >= 0)
         scalars, reward = infos.get(batches.APART_SCALARS, ()), infos.get(batches.APART_REWARD, ())
-        if type(reward) is not tuple or len(reward) > 1:
+        if type(reward) is not tuple or len(reward) > 1 or type(scalars) is not tuple:
             raise RemoteProtocolError("the worker sent more than one reward")
-        own: list[list[dict[Any, Any]]] = [[] for _ in range(self.count)]
-        for index in places:
-            if type(infos[index]) is not dict or index >= 2 * self.count:
-                raise RemoteProtocolError(_NOT_ONE_EACH)
-            own[index % self.count].append(infos[index])
-        if type(scalars) is not tuple:
-            raise RemoteProtocolError(_NOT_ONE_EACH)
-        for key in infos:  # our masks of the sub-environments that were lost and came back
-            if f"_{key}" in infos:
-                for at in np.flatnonzero(infos[f"_{key}"]):
-                    own[at] = [*own[at][:-1], {**(own[at] or [{}])[-1], key: True}]
-        return own, scalars, reward
+        each = infos_of.each_of(infos, self.count)
+        return [[info for info, _ in some] for some in each], scalars, reward
 
     def _restored(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         final = infos.get("final_obs") if self.restores else None
@@ -257,17 +206,11 @@ class Results:
         return bool(part.ndim == 1 or not self.manifest.sync)
 
 
-def _own_infos(value: Any, size: int) -> Sequence[OwnInfo]:
-    """Check the infos of one shard, each with index and forms. Trust: input from the worker."""
-    each: Any = value if type(value) is tuple else (None,)
-    for own in each:
-        if type(own) is not tuple or list(map(type, own)) != [int, dict, dict]:
-            raise RemoteProtocolError(_NOT_ONE_EACH)
-        if not 0 <= own[0] < size:
-            raise RemoteProtocolError("the worker's infos are of an unknown sub-environment")
-        if not batches.are_forms(own[2]):
-            raise RemoteProtocolError("the worker's infos have an unknown form")
-    return cast("Sequence[OwnInfo]", each)
+def _refuse_reward(infos: dict[Any, Any]) -> None:
+    """Raise ``RemoteEnvError`` if unjoined infos, which ``own`` has read, have an odd reward."""
+    for reward in infos.get(batches.APART_REWARD, ()):
+        shown = one_line(batches.reward_misfit(reward, 0), _SHOWN)
+        raise remote_error("ValueError", "ValueError", shown)
 
 
 def all_replies(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:
@@ -281,6 +224,11 @@ def all_replies(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M],
     for reply in others:
         typed_reply(reply, kind)
     return cast("list[m.M]", replies)
+
+
+def is_of_joining(error: BaseException) -> bool:
+    """Whether infos could not be joined: only then does a ``RemoteEnvError`` have a cause here."""
+    return isinstance(error, RemoteEnvError) and error.__cause__ is not None
 
 
 def is_batch(part: Any) -> bool:

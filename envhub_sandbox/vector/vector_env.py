@@ -237,7 +237,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:
         replies = self._requests.collect(timeout_s, m.ResetDone)
-        return self._requests.finish_reset(replies, timeout_s)
+        return self._requests.finish_reset(replies)
 
     def step(self, actions: Any) -> StepResult:
         """Step every sub-environment.

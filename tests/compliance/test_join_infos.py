@@ -1,17 +1,20 @@
-"""Infos that come from several shards are what one vector environment would have made of them.
-Except where sub-environments disagree about a key's dtype: Gymnasium casts to the first one's, and
-each shard has a first one of its own."""
+"""Infos that come from several shards are what one vector environment would have made of them."""
 
 import itertools
 import warnings
 from typing import Any
 
 import numpy as np
+import pytest
+from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_worker.protocol.spaces.batches import join_infos
+from envhub_sandbox.transport.results import Results
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.spaces import batches
+from tests.support import wire
 from tests.support.compare import assert_same
 
 VALUES: dict[str, st.SearchStrategy[Any]] = {
@@ -40,13 +43,41 @@ def added(infos: list[dict[str, Any]]) -> dict[str, Any]:
     return joined
 
 
-@given(st.lists(INFO, min_size=1, max_size=6), st.data())
+def sent(infos: list[dict[str, Any]]) -> dict[Any, Any]:
+    """What a shard sends, as it arrives."""
+    pairs = [(index, info) for index, info in enumerate(infos) if info]
+    forms = [batches.forms_of(info) for _, info in pairs]
+    columns = batches.flat_infos(pairs, len(infos))
+    own = batches.own_infos(pairs, len(infos), forms) if columns is None else columns
+    arrived = m.unpack(m.pack(m.Value(own)))
+    assert isinstance(arrived, m.Value)
+    return arrived.value  # type: ignore[return-value]
+
+
+NUMBERS = st.sampled_from([1, 2, 0.5, True, 2**60 + 1, np.int64(300), np.int8(3), np.float32(0.1)])
+NUMBER = st.fixed_dictionaries({"number": NUMBERS})
+ANY = st.sampled_from([1, 0.5, "text", None, np.float64(0.1), np.array(None), np.ones(2), {}])
+UNLIKE = st.tuples(INFO, st.fixed_dictionaries({}, optional={"number": NUMBERS, "any": ANY}))
+
+
+@given(
+    st.lists(NUMBER | UNLIKE.map(lambda two: two[0] | two[1]), min_size=2, max_size=6)
+    | st.lists(NUMBER, min_size=2, max_size=6),
+    st.data(),
+)
 def test_shards_join_as_one_batch(infos: list[dict[str, Any]], data: st.DataObject) -> None:
     """However the sub-environments are cut into shards, the joined infos are Gymnasium's."""
-    cuts = data.draw(st.sets(st.integers(1, max(1, len(infos) - 1))))
-    edges = [0, *sorted(cut for cut in cuts if cut < len(infos)), len(infos)]
-    shards = [infos[start:stop] for start, stop in itertools.pairwise(edges)]
+    cuts = data.draw(st.sets(st.integers(1, len(infos) - 1), min_size=1))
+    bounds = [*itertools.pairwise([0, *sorted(cuts), len(infos)])]
+    space = spaces.Discrete(2)
+    results = Results(wire.env_manifest(space, space, len(infos)), bounds)
+    parts = [sent(infos[start:stop]) for start, stop in bounds]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        expected = added(infos)
-        assert_same(expected, join_infos([added(s) for s in shards], [len(s) for s in shards]))
+        try:
+            expected = added(infos)
+        except Exception as error:
+            with pytest.raises(type(error)):
+                results.infos(parts)
+            return
+        assert_same(expected, results.infos(parts))

@@ -189,47 +189,39 @@ def final(members: list[Any]) -> Any:
 def infos(dice: Dice) -> None:
     """One shard's lies do not reach another's rows, and there is one entry each."""
     rng = dice.rng
-    sizes = rng.choice(SIZES[1:])
+    sizes = rng.choice(SIZES)
+    stops = np.cumsum(sizes).tolist()
+    joins = Results(env_manifest(), list(zip([0, *stops], stops, strict=False)))
     honest = [_infos(size, rng) for size in sizes]
     lies = [dice.spoiled(part) for part in honest]
     if any(type(part) is not dict for part in lies):
         raise NotSentError
-    given = [honest[0], lies[1]] if rng.random() < 0.5 else lies
-    joined = batches.join_infos(given, sizes)
-    _check_joined(joined, sum(sizes))
+    given = [honest[0], *lies[1:]] if rng.random() < 0.5 else lies
+    joined = joins.infos(given)
+    _check_joined(joined, stops[-1])
     if given[0] is honest[0]:
-        for key, value in honest[0].items():
-            mine = joined[key]
+        alone = joins.infos([honest[0], *({} for _ in sizes[1:])])
+        for key, value in alone.items():
             if type(value) is np.ndarray:
-                demand(alike(list(mine[: sizes[0]]), list(value)), f"{key} of the other shard")
-    usable(joined)
-
-
-def apart(dice: Dice) -> None:
-    """Infos that are joined one by one are of those who said them, or an error of ours."""
-    sizes = dice.rng.choice(SIZES)
-    stops = np.cumsum(sizes).tolist()
-    found = Results(env_manifest(), list(zip([0, *stops], stops, strict=False)))
-    own = {"a": 1, "b": {"c": "x"}}, {"b": ("_b", False, {"c": ("_c", True, {})})}
-    honest = [tuple((index, *own) for index in range(size)) for size in sizes]
-    with UNTRUSTED:
-        joined = found.joined_own([m.Value(dice.spoiled(part)) for part in honest])
-    for key, value in joined.items():
-        told = type(value) is dict or (type(value) is np.ndarray and len(value) == stops[-1])
-        demand(told, f"{key!r} of another length")
+                mine = joined[key][: sizes[0]]
+                demand(alike(list(mine), list(value[: sizes[0]])), f"{key} of the other shard")
     usable(joined)
 
 
 def _infos(size: int, rng: random.Random) -> dict[Any, Any]:
-    mask = np.ones(size, bool)
-    made: dict[Any, Any] = {
-        "speed": np.arange(size, dtype=float), "_speed": mask,
-        "name": np.array(["a"] * size, object), "_name": mask,
-        "pos": np.ones((size, 3), np.float32), "_pos": mask,
-        "deep": {"x": np.arange(size), "_x": mask, "y": {"z": np.ones(size), "_z": mask}},
-        "_deep": mask, (1, 2): np.zeros(size), "_(1, 2)": mask,
+    """What a shard sends: columns, or each sub-environment's own."""
+    if rng.random() < 0.5:
+        info = {"speed": 0.5, "count": np.int64(3)}
+        columns = batches.flat_infos([(index, info) for index in range(size)], size)
+        assert columns is not None
+        return columns
+    own: dict[Any, Any] = {
+        "speed": 0.5, "name": "a", "pos": np.ones(3, np.float32), (1, 2): 0.0,
+        "deep": {"x": 1, "y": {"z": 0.5}},
     }  # fmt: skip
-    return {key: made[key] for key in made if rng.random() < 0.8}
+    forms = {"deep": ("_deep", False, {"x": ("_x", True, {})})}
+    own = {key: own[key] for key in own if rng.random() < 0.8}
+    return batches.own_infos([(index, own) for index in range(size)], size, [forms] * size)
 
 
 def _check_joined(joined: dict[Any, Any], count: int) -> None:
@@ -524,7 +516,7 @@ def column_schemas(dice: Dice) -> None:
 TARGETS: dict[str, Callable[[Dice], None]] = {
     one.__name__: one
     for one in (
-        unpack, things, results, infos, apart, restore, manifest, built, generators, relay,
+        unpack, things, results, infos, restore, manifest, built, generators, relay,
         warnings, server, tracebacks, stream, packed, column_schemas,
     )
 }  # fmt: skip

@@ -29,7 +29,6 @@ from envhub_sandbox.session.counters import LEDGER, FleetCounters, Labels
 from envhub_sandbox.session.env_session import GRACE_S, EnvSession
 from envhub_sandbox.session.lease import AttributeCache
 from envhub_sandbox.session.recorder import Recorder
-from envhub_sandbox.session.recovery import mark_revived
 from envhub_sandbox.session.requests import (
     MessageFor,
     OneMessageFor,
@@ -267,7 +266,7 @@ class FleetRequests(RequestOrder):
             return self._each[at].collect(deadline, kind)
 
         replies = self._of_all(take)
-        self.note_answered(kind)
+        self.note_answered()
         return [*chain.from_iterable(replies)]
 
     def one_each(
@@ -281,21 +280,13 @@ class FleetRequests(RequestOrder):
 
         return tuple(chain.from_iterable(self._of_all(take)))
 
-    def finish_reset(
-        self, replies: list[m.ResetDone], timeout: float | Deadline | None
-    ) -> tuple[Any, dict[Any, Any]]:
+    def finish_reset(self, replies: list[m.ResetDone]) -> tuple[Any, dict[Any, Any]]:
         """Turn the parts' replies into one result of ``VectorEnv.reset``; raises as ``collect``."""
 
         def take(at: int) -> tuple[Any, dict[Any, Any]]:
-            return self._each[at].finish_reset([replies[at]], timeout)
+            return self._each[at].finish_reset([replies[at]])
 
-        parts = self._of_all(take)
-        try:
-            result = self.results.joined_resets(parts)
-        except batches.Misfit:
-            result = self.results.joined_resets(parts, self._infos_apart(deadline_of(timeout)))
-        self.note_answered()
-        return result
+        return self.results.joined_resets(self._of_all(take))
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -345,8 +336,9 @@ class FleetRequests(RequestOrder):
         self._counters.stepped(perf_counter_ns() - self._sent_ns)
         try:
             result = self.results.joined_steps(parts)
-        except batches.Misfit:
-            result = self.results.joined_steps(parts, self._infos_apart(deadline))
+        except RemoteEnvError:
+            self._of_all(lambda at: self._each[at].forget_ends(deadline))
+            raise
         self.note_answered()
         return result
 
@@ -356,24 +348,6 @@ class FleetRequests(RequestOrder):
             return self._each[at].collect_step(deadline)
         finally:
             self._counters.waited(at, perf_counter_ns() - begun_ns)
-
-    def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
-        """Fetch each sub-environment's last infos, since the parts' joined infos do not match."""
-        failed = False
-
-        def take(at: int) -> list[m.Value]:
-            return self._each[at].checked_own_infos(deadline, failed=failed)
-
-        own = self._of_all(take)
-        try:
-            infos = self.results.joined_own([*chain.from_iterable(own)])
-        except RemoteEnvError:
-            failed = True
-            self._of_all(take)
-            raise
-        pairs = zip(self._each, self.results.bounds, strict=True)
-        fresh = [bounds for requests, bounds in pairs if requests.came_back]
-        return mark_revived(infos, self.results.count, fresh) if fresh else infos
 
     # --- all parts together ----------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from gymnasium.error import AlreadyPendingCallError
 
-from envhub_sandbox.errors import EnvHubError, RemoteEnvWarning, RemoteProtocolError, remote_error
+from envhub_sandbox.errors import EnvHubError, RemoteEnvWarning, RemoteProtocolError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.requests import MessageFor
 from envhub_sandbox.transport.deadline import Deadline
@@ -25,7 +25,6 @@ from envhub_sandbox.transport.results import Results, StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.limits import MAX_IN_FLIGHT
-from envhub_worker.protocol.spaces import batches
 
 
 class WorkerQueue:
@@ -170,10 +169,7 @@ class WorkerQueue:
                 raise failure
         self.taking = True  # interruption.md, rule 1
         try:
-            result = self._take()
-            if self._sliced:
-                self._check(result)
-            keep(result)
+            keep(self._take())
         except (EnvHubError, RemoteEnvWarning):
             self._go_on()
             with self._naming():
@@ -192,7 +188,13 @@ class WorkerQueue:
 
     def _take(self) -> StepResult:
         *result, infos = self._collect()
-        infos = self._results().joined(infos)
+        try:
+            infos = self._results().joined(infos)
+            if self._sliced and len(result) > 1 and result[1].ndim != 1:
+                raise RemoteProtocolError("the worker sent rewards that are not one number each")
+        except BaseException:
+            with self._requests.use.judging("recv"):  # only on failure, as it costs microseconds
+                raise
         if len(result) > 1:
             return (*result, infos)  # of a step
         no = np.zeros(self.count, np.bool_)
@@ -206,22 +208,7 @@ class WorkerQueue:
         if self._owed[0] == "step":
             return self._requests.collect_step(self._deadline)
         replies = self._requests.collect(self._deadline, m.ResetDone)
-        return self._requests.finish_reset(replies, self._deadline)
-
-    def _check(self, result: StepResult) -> None:
-        """Raise if a result cannot be joined with other workers'. Trust: input from the worker."""
-        try:
-            if result[1].ndim != 1:
-                raise RemoteProtocolError("the worker sent rewards that are not one number each")
-            if batches.is_apart(result[4]):
-                start, stop = self.rows
-                name = ValueError.__name__
-                text = f"the infos of sub-environments {start} to {stop - 1} do not go together"
-                raise remote_error(name, name, text)
-            batches.check_infos(result[4], self.count)
-        except BaseException:
-            with self._requests.use.judging("recv"):  # only on failure, as it costs microseconds
-                raise
+        return self._requests.finish_reset(replies)
 
     def _go_on(self) -> None:
         """After an answer, go on to the next request, if the worker is READY."""

@@ -46,7 +46,7 @@ from envhub_worker.protocol.shared_memory.packets import (
     read_packet,
     write_packet,
 )
-from envhub_worker.protocol.shared_memory.slabs import columns_of, own_infos
+from envhub_worker.protocol.shared_memory.slabs import columns_of
 
 if TYPE_CHECKING:
     from envhub_worker.protocol.shared_memory.descriptors import Watch
@@ -105,6 +105,7 @@ class ShardSlabs:
         reply: The memory of the reply slab.
 
     Attributes:
+        schema: The columns of the infos; a new schema makes a new list.
         told_bytes, answer_bytes: The total bytes of messages and of their answers so far.
     """
 
@@ -113,9 +114,8 @@ class ShardSlabs:
         self._request, self._reply = request, reply
         self._asks = slabs.words(request)  # the header that we write
         self._tells = slabs.words(reply)  # the header that the runner writes: read each word once
-        self._columns: Schema = []  # of the infos that came encoded last
-        # Those infos, if they are one dict per sub-environment.
-        self._own: dict[Any, Any] | None = None
+        self.schema: Schema = []  # of the infos that came encoded last
+        self._beside: dict[Any, Any] = {}  # what else these have
         # By leaf and dtype: the dtype's code, and the leaf's area in the slab as an array of it.
         self._views: dict[tuple[int, Any], Any] = {}
         self._codes = [_UNKNOWN] * len(layout.actions)  # as they stand in the slab
@@ -316,38 +316,22 @@ class ShardSlabs:
     def _learn(self, infos: dict[Any, Any]) -> None:
         start = slabs.INFOS
         columns = columns_of(infos) or ()
-        self._columns = [(column, column.view(self._reply, start)) for column in columns]
-        self._own = None if own_infos(infos) is None else infos
-        self._asks[slabs.KNOWN] = max((c.offset + v.nbytes for c, v in self._columns), default=0)
-
-    @property
-    def schema(self) -> Schema:
-        """The columns of the infos; a new schema makes a new list."""
-        return self._columns if self._own is None else []
+        self._beside = {key: value for key, value in infos.items() if columns and type(key) is int}
+        self.schema = [(column, column.view(self._reply, start)) for column in columns]
+        self._asks[slabs.KNOWN] = max((c.offset + v.nbytes for c, v in self.schema), default=0)
 
     def columns(self) -> dict[Any, Any]:
         """The infos that came as columns, copied into new arrays."""
-        if not self._columns:
+        if not self.schema:
             raise RemoteProtocolError("the worker sent columns before their schema")
-        columns = {column.key: view.astype(column.dtype) for column, view in self._columns}
-        if self._own is None:
-            return columns
-        first = self._own[0]
-        rows = zip(*(_members(one, columns[key]) for key, one in first.items()), strict=True)
-        own = enumerate(dict(zip(first, row, strict=True)) for row in rows)
-        return {**self._own, **dict(own)}
+        columns = {column.key: view.astype(column.dtype) for column, view in self.schema}
+        return {**columns, **self._beside}
 
     def close(self) -> None:
         """Release the views; the maps go with the last array over them."""
         self._asks.release()
         self._tells.release()
         self._answers.release()
-
-
-def _members(known: Any, column: Any) -> Sequence[Any]:
-    """A column's values, in the class of the schema's value: Python's or numpy's."""
-    kept = isinstance(known, (np.generic, np.ndarray))
-    return list(column) if kept else column.tolist()
 
 
 class LaneShard(ShardSlabs):

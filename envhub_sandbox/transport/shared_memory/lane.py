@@ -244,14 +244,14 @@ class SharedMemoryLane(SlabLane):
         if self._checked is None:
             self._answers = self._replies(deaths, deadline)
 
-    def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
+    def result(self) -> StepResult:
         """Implements ``Lane.result``; a form that was checked before is not checked again."""
         checked, self._checked = self._checked, None
-        if checked is not None and infos is None:
+        if checked is not None:
             observation, rewards, ended, cut, own = checked
             return observation, rewards, ended, cut, own
-        done = super().result(infos)
-        if self._asked == STEP and infos is None:
+        done = super().result()
+        if self._asked == STEP:
             self.shards[0].note_checked()
         return done
 
@@ -259,11 +259,6 @@ class SharedMemoryLane(SlabLane):
         """Implements ``Lane.leave_slots``."""
         for ring in self.slots:
             ring.leave()
-
-    def send_for_infos(self, *, failed: bool = False) -> None:
-        """Implements ``Lane.send_for_infos``, over the server."""
-        self._asked = BY_SERVER
-        super().send_for_infos(failed=failed)
 
     def replies(self, deadline: Deadline) -> list[m.Message]:
         """Implements ``Lane.replies``."""

@@ -144,9 +144,9 @@ class ServedLane(ColumnSteps):
         else:
             Lane.wait(self, deadline)
 
-    def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
+    def result(self) -> StepResult:
         """Implements ``Lane.result``. Trust: input from the worker."""
-        return super().result(infos) if self._by_slabs else Lane.result(self, infos)
+        return super().result() if self._by_slabs else Lane.result(self)
 
     def _outcomes(self, deadline: Deadline) -> tuple[list[Outcome], dict[int, WorkerDiedError]]:
         deaths: dict[int, WorkerDiedError] = {}

@@ -164,14 +164,13 @@ class ColumnSteps(SlabLane):
         if deaths:
             raise RunnersDiedError(self._stepped(deaths), deaths)
 
-    def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
+    def result(self) -> StepResult:
         """Implements ``Lane.result``. Trust: input from the worker."""
-        if infos is None:
-            infos = self._infos() if self._said else {}
-        return (self._batch.take(), *self._batch.results(), infos)
+        return self._batch.take(), *self._batch.results(), self._infos() if self._said else {}
 
     def _infos(self) -> dict[Any, Any]:
-        if len(self.shards) > 1 and all(kind == slabs.COLUMNS for kind, _ in self._said):
+        columns = all(kind == slabs.COLUMNS for kind, _ in self._said)
+        if columns and len(self.shards) > 1 and not self.declared.unjoined:
             schemas = [shard.schema for shard in self.shards]
             if not self._joined.is_of(schemas):
                 self._joined = JoinedColumns(schemas, self._bounds)

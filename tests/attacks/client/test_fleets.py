@@ -34,7 +34,11 @@ ALL = 2 * NUM_ENVS
 HONEST = slice(NUM_ENVS, ALL)
 ACTIONS = [0] * ALL
 TRUE = {"observation": np.full((NUM_ENVS, 3), 0.5, np.float32), "rewards": np.full(NUM_ENVS, 7.0)}
-INFO = {"a": np.arange(NUM_ENVS), "_a": np.ones(NUM_ENVS, bool)}
+INFO = {
+    "a": np.arange(NUM_ENVS),
+    "_a": np.ones(NUM_ENVS, bool),
+    batches.APART_CLASSES: {"a": False},
+}
 
 
 @pytest.fixture
@@ -122,13 +126,19 @@ def test_values_for_others_are_refused(liar: LyingServer, honest: LyingServer, f
         assert states(env) == ["DEAD", "READY"]
 
 
-OWN: dict[str, Any] = {
-    "of a row of the other's": ((NUM_ENVS, {"a": -1}, {}), (0, {"a": -1}, {})),
-    "of a row before the first": ((-1, {"a": -1}, {}),),
-    "of none": 3,
-    "that are no mapping": ((0, [1], {}),),
-    "whose mask is no text": ((0, {"a": -1}, {"a": (3, True, {})}),),
-    "whose inner forms are none": ((0, {"a": {}}, {"a": ("_a", False, {"b": 1})}),),
+_PLAIN = {"a": False}
+OWN: dict[str, dict[Any, Any]] = {
+    "of a row of the other's": {2 * NUM_ENVS: {"a": -1}},
+    "of no row": {"0": {"a": -1}},
+    "that are no mapping": {0: [1]},
+    "whose mask is no text": {0: {"a": -1}, batches.APART_FORMS: {0: {"a": (3, True, {})}}},
+    "whose inner forms are none": {0: {"a": {}}, batches.APART_FORMS: {0: {"a": ("_a", False, 1)}}},
+    "whose forms are none": {0: {"a": 1}, batches.APART_FORMS: 3},
+    "with marks of all rows": {"x": np.ones(ALL), "_x": np.ones(ALL, bool)},
+    "in columns of all rows": {"a": np.zeros(ALL), "_a": 1, batches.APART_CLASSES: _PLAIN},
+    "in columns of no numbers": {"a": np.full(2, None), "_a": 1, batches.APART_CLASSES: _PLAIN},
+    "in columns that are missing": {batches.APART_CLASSES: _PLAIN},
+    "in columns of no class": {"a": np.zeros(NUM_ENVS), "_a": 1, batches.APART_CLASSES: ["a"]},
 }
 
 
@@ -136,50 +146,27 @@ OWN: dict[str, Any] = {
 def test_others_infos_refused(
     liar: LyingServer, honest: LyingServer, folder: str, what: str
 ) -> None:
-    """Where infos do not fit together they are asked for one by one, and each is of a row."""
+    """Each worker's infos are of its own rows, as columns or one by one."""
     with fleet(liar, honest, folder) as env:
-        honest.lies[m.FetchInfosApart] = relayed(m.Value(((0, {"a": 1}, {}), (1, {"a": 2}, {}))))
-        liar.lies[m.Step] = relayed(step_done(**TRUE, info={"a": np.zeros(ALL)}))
-        liar.lies[m.FetchInfosApart] = relayed(m.Value(((0, {"a": 8}, {}), (1, {"a": 9}, {}))))
-        assert env.step(ACTIONS)[4]["a"].tolist() == [8, 9, 1, 2]  # the control
-        liar.lies[m.FetchInfosApart] = relayed(m.Value(OWN[what]))
+        liar.lies[m.Step] = relayed(step_done(**TRUE, info={0: {"a": 8}, 1: {"a": 9.5}}))
+        assert env.step(ACTIONS)[4]["a"].tolist() == [8, 9, 0, 1]  # the control
+        liar.lies[m.Step] = relayed(step_done(**TRUE, info=OWN[what]))
         error = refuses(lambda: env.step(ACTIONS))
         assert isinstance(error, errors.RemoteProtocolError)
         assert states(env) == ["DEAD", "READY"]
 
 
-def test_infos_that_would_take_too_much_are_joined_one_by_one() -> None:
-    """A column has room for every row of the fleet: one of the liar's makes it as large."""
-    described = wire.env_manifest(OBSERVATION, ACTION, 64, sync=True)
-    joins = Results(described, [(0, 1), (1, 64)])
-    large = {"a": np.ones((1, 1 << 20), np.uint8), "_a": np.ones(1, bool)}
-    parts: list[Any] = [
-        (
-            np.zeros((rows, 3), np.float32),
-            np.zeros(rows),
-            np.zeros(rows, bool),
-            np.zeros(rows),
-            info,
-        )
-        for rows, info in ((1, large), (63, {}))
-    ]
-    assert joins.joined_steps(parts)[4]["a"].shape == (64, 1 << 20)  # the control
-    joins.max_bytes = 32 << 20
-    with pytest.raises(batches.Misfit):
-        joins.joined_steps(parts)
-    with pytest.raises(batches.Misfit):
-        joins.joined_resets([(part[0], part[4]) for part in parts])
-
-
 def test_own_infos_that_would_take_too_much_are_refused() -> None:
     """Joined here, one row's makes a column for all; and what does not fit is told in short."""
-    joins = Results(wire.env_manifest(OBSERVATION, ACTION, 64, sync=True), [(0, 64)])
-    assert joins.joined_own([m.Value(((0, {"a": np.zeros(1000)}, {}),))])["a"].shape == (64, 1000)
+    joins = Results(wire.env_manifest(OBSERVATION, ACTION, 64, sync=True), [(0, 1), (1, 64)])
+    large = {0: {"a": np.zeros(1 << 20, np.uint8)}}
+    assert joins.infos([large, {}])["a"].shape == (64, 1 << 20)  # the control
+    joins.max_bytes = 32 << 20
     with pytest.raises(errors.MessageTooLargeError):
-        joins.joined_own([m.Value(((0, {"a": np.zeros(1 << 20)}, {}),))])
+        joins.infos([large, {}])
     name = "x" * 100_000
     with pytest.raises(errors.RemoteEnvError) as caught:
-        joins.joined_own([m.Value(((0, {name: 1.0}, {}), (1, {name: "text"}, {})))])
+        joins.infos([{0: {name: 1.0}}, {0: {name: "text"}}])
     assert len(str(caught.value)) < 1000
 
 
@@ -190,12 +177,12 @@ def test_infos_that_came_apart_are_of_its_own_rows_alone() -> None:
     honest = {1: {"a": 2}, 3: {"b": 3}}
     ended = joins.own(joins.infos([{0: {"a": 1}}, honest]))[0]
     assert ended == [[{"a": 1}], [], [{"a": 2}, {"b": 3}]]  # the control
-    for place in (2, 5, -1, -3, 1 << 70):
-        lied = joins.own(joins.infos([{place: {"a": 9}}, honest]))[0]
+    for key in (-5, -(1 << 70)):
+        lied = joins.own(joins.infos([{key: {"a": 9}}, honest]))[0]
         assert lied == [[], [], [{"a": 2}, {"b": 3}]]
     marked = {"lost": np.full(1, 7), "_lost": np.ones(1, bool)}  # one is true, whatever it holds
     assert joins.own(joins.infos([marked, honest]))[0][0] == [{"lost": True}]
-    lies: list[Any] = [{place: {"a": 9}} for place in ("0", True, None)]
+    lies: list[Any] = [{place: {"a": 9}} for place in ("0", True, None, 2, 5, 1 << 70)]
     lies += [{0: 5}, {0: RemoteObject("t", "r")}, {"x": np.ones(9), "_x": np.ones(9, bool)}]
     for infos in lies:
         with pytest.raises(errors.RemoteProtocolError):

@@ -24,7 +24,6 @@ from envhub_sandbox.transport import results
 from envhub_worker.protocol import errors
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
-from envhub_worker.protocol.spaces import batches
 from tests.attacks.client.lies import ACTIONS, opened, relayed, started
 from tests.attacks.client.lying_server import (
     NUM_ENVS,
@@ -274,7 +273,9 @@ def test_odd_graph_observations(
 
 def test_masks_longer_than_their_values_are_refused() -> None:
     honest = {"a": np.zeros(1), "_a": np.ones(1, bool)}
+    joins = results.Results(env_manifest(), [(0, 1), (1, NUM_ENVS)])
+    assert joins.infos([honest, honest])["a"].tolist() == [True, True]  # the control
     for mask in (np.ones(3, bool), np.ones((1, 1), bool), [True, True], None):
         lie = {"a": np.zeros(1, np.int8), "_a": mask}
         with pytest.raises(RemoteProtocolError):
-            batches.join_infos([honest, lie], [1, 1])
+            joins.infos([honest, lie])

@@ -35,7 +35,6 @@ from envhub_worker.runner.prefixes import WarningLog, Watches
 from envhub_worker.runner.recording import standing_in
 from envhub_worker.runner.returned import misfit_in_vector
 from envhub_worker.runner.state import generators
-from envhub_worker.runner.state.copies import taken
 from envhub_worker.runner.state.shared_state import SharedState
 from envhub_worker.runner.sync_envs import Pairs, SubEnvs
 from envhub_worker.runner.tasks import ResultError, Task, tasks_of
@@ -285,17 +284,10 @@ class Runner:
         lane = self.lanes.get(request.env)
         return m.Value({} if lane is None else lane.infos())
 
-    def fetch_infos_apart(self, request: m.FetchInfosApart) -> m.Message:
-        """Returns the last reset's or step's infos as each sub-environment returned them."""
-        env = self._envs[request.env]
-        if not isinstance(env, SubEnvs):
-            return m.Value(())
-        if request.failed:
-            env.forget_ends()
-            return m.Value(())
-        # Arrays lose their class, as in a column; a masked array would arrive as text.
-        each = ((index, taken(info), batches.forms_of(info)) for index, info in env.pairs)
-        return m.Value(tuple(each))
+    def forget_ends(self, request: m.ForgetEnds) -> m.Message:
+        """Forget which episodes ended in the last step, whose infos cannot be joined."""
+        self._envs[request.env].forget_ends()
+        return m.Value(None)
 
     def take_apart(self, request: m.TakeApart) -> m.Message:
         """Send each sub-environment's own infos from now on."""
@@ -465,7 +457,7 @@ def _own(env: Any, name: str) -> Any:
         return getattr(getattr(env, "unwrapped", env), name)
 
 
-_WITH_INFOS = frozenset({m.Reset, m.Step, m.Revive, m.FetchInfos, m.FetchInfosApart})
+_WITH_INFOS = frozenset({m.Reset, m.Step, m.Revive, m.FetchInfos})
 """Whose replies have infos, of which one part must not lose the others."""
 _HANDLERS: dict[type[m.Message], Callable[[Runner, Any], m.Message]] = {
     m.Load: Runner.load,
@@ -487,7 +479,7 @@ _HANDLERS: dict[type[m.Message], Callable[[Runner, Any], m.Message]] = {
     m.Close: Runner.close,
     m.Attach: Runner.attach,
     m.FetchInfos: Runner.fetch_infos,
-    m.FetchInfosApart: Runner.fetch_infos_apart,
+    m.ForgetEnds: Runner.forget_ends,
     m.TakeApart: Runner.take_apart,
     m.RaisedException: lambda runner, unreadable: unreadable,
 }

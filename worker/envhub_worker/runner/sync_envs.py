@@ -172,8 +172,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         batch: The memory that ``reset`` and ``step`` write their results into.
         reward_shape: Shape of one sub-environment's reward; not ``()`` for multi-objective ones.
         sliced: Whether other processes hold the rest of the vector environment.
-        apart: Whether each sub-environment's own infos are sent, not joined ones.
-        pairs: Each sub-environment's own infos of the last reset or step.
+        apart: Whether each sub-environment's own infos are sent as they are, also if no other
+            process holds a slice.
         driven: The objects to reset, step and render: ``envs``, or a ``FreezingEnv`` for each.
         integers: Which discrete parts of the last observation are Python ints. Only kept for a
             single environment (``_single``).
@@ -204,7 +204,6 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self._siblings = sync and self.num_envs > 1
         self.sliced = sliced
         self.apart = False
-        self.pairs: Pairs = []
         self.integers: list[bool] = []
         self.shared: SharedState | None = None
         self.reward: tuple[Any, ...] = ()
@@ -226,7 +225,6 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             self.driven = [FreezingEnv(one) for one in self.envs]
         self._done_before = self._done
         infos: Pairs = []
-        self.pairs = infos
         self.reward = ()
         copied = self._copier()
         for index in chosen:
@@ -266,8 +264,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                 self.num_envs,
             )
             finals = [(i, {"final_obs": row, "final_info": {}}) for i, row in enumerate(fresh)]
-            self.pairs = sorted([*finals, *infos], key=itemgetter(0))
-            return self.pairs
+            return sorted([*finals, *infos], key=itemgetter(0))
         self._done = [True] * self.num_envs
         return infos
 
@@ -286,7 +283,6 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         done = [False] * count
         copied = self._copier()
         infos: Pairs = []
-        self.pairs = infos
         index, answered, over, again = 0, -1, False, -1
         each = zip(range(count), self._each(actions), self.driven, self._done, rows, strict=True)
         try:
@@ -396,28 +392,30 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         return getattr(self.driven[index], name) if freezes else None
 
     def joined(self, pairs: Pairs) -> dict[Any, Any]:
-        """Returns infos in the form in which they are sent: joined, or apart.
+        """Returns infos in the form in which they are sent: joined, or each sub-environment's own.
 
-        Infos that do not join in this slice may join in the whole batch, where another
-        sub-environment is the first. The client then asks for each sub-environment's own.
+        A slice sends its own ones, because the first sub-environment with a key decides how values
+        are joined, and that may be in another slice.
         """
-        if self.apart:
-            infos: dict[Any, Any] = {}
-            for index, info in pairs:
-                infos[index + self.num_envs if index in infos else index] = info
-            if any(self.integers):
-                infos[batches.APART_SCALARS] = tuple(self.integers)
-            if self.reward:
-                infos[batches.APART_REWARD] = self.reward
-            return infos
-        try:
-            join = batches.join_slice if self.sliced else batches.join_pairs
-            return join(pairs, self.num_envs)
-        except Exception:
-            if self.sliced:
-                return dict(batches.APART)
-            self.forget_ends()
-            raise
+        if not (self.apart or self.sliced):
+            try:
+                return batches.join_pairs(pairs, self.num_envs)
+            except Exception:
+                self.forget_ends()
+                raise
+        infos = batches.flat_infos(pairs, self.num_envs)
+        if infos is None:
+            forms: Sequence[batches.Forms] = ()
+            if not self.apart:
+                # arrays lose their class, as in a column; a masked array would arrive as text
+                pairs = [(index, taken(info)) for index, info in pairs]
+                forms = [batches.forms_of(info) for _, info in pairs]
+            infos = batches.own_infos(pairs, self.num_envs, forms)
+        if any(self.integers):
+            infos[batches.APART_SCALARS] = tuple(self.integers)
+        if self.reward:
+            infos[batches.APART_REWARD] = self.reward
+        return infos
 
     def forget_ends(self) -> None:
         """Forget which episodes the last step ended, since its infos could not be joined:

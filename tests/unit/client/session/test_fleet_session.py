@@ -116,8 +116,8 @@ def test_infos_that_break_a_rule_end_their_worker_alone(
         flight.recv(2, 0)
     assert [part.lifecycle.state for part in session.parts] == [State.DEAD, State.PENDING]
     assert received(flight, 2) == [1]
-    lanes[1].infos = {None: None}
+    lanes[1].infos = {0: {"x": 1}, 1: {"x": "text"}}  # an episode's, and the next one's
     send(flight, 1)
-    with pytest.raises(errors.RemoteEnvError, match="do not go together"):  # as Gymnasium's
+    with pytest.raises(errors.RemoteEnvError, match="info 'x' of sub-environment 0"):
         flight.recv(1, 0)
     assert session.parts[1].lifecycle.state is State.READY

@@ -118,8 +118,8 @@ def test_rewards_of_a_worker_among_others_are_one_number_each() -> None:
     """Else they cannot be joined with others'; alone, a worker may give any shape."""
 
     class Wide(FakeLane):
-        def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-            observation, _, *rest = super().result(infos)
+        def result(self) -> StepResult:
+            observation, _, *rest = super().result()
             return (observation, np.zeros((1, 2)), *rest)
 
     session = fleet_over([FakeLane(1), Wide(1)]).parts[1]

@@ -17,13 +17,19 @@ def test_other_options_announce_nothing(options: Any) -> None:
     assert not announces_rollout(options)
 
 
-def test_a_slice_says_what_it_cannot_join() -> None:
-    """What is no array by itself may be one among others: those are to be asked apart."""
+def test_a_slice_joins_what_loses_nothing() -> None:
+    """What is no array by itself may be one among others."""
     pairs: list[tuple[int, dict[Any, Any]]] = [(0, {"a": 1}), (1, {"a": "text"})]
     make = [lambda: gym.make("CartPole-v1")] * 2
     with pytest.raises(ValueError, match="info 'a' of sub-environment 1"):
         SubEnvs(make, "NextStep", sync=True).joined(pairs)
-    assert SubEnvs(make, "NextStep", sync=True, sliced=True).joined(pairs) == batches.APART
+    sliced = SubEnvs(make, "NextStep", sync=True, sliced=True)
+    assert sliced.joined(pairs) == dict(pairs)
+    columns = sliced.joined(
+        [(0, {"a": 1, "b": np.float32(0.5)}), (1, {"a": 2, "b": np.float32(2)})]
+    )
+    assert columns[batches.APART_CLASSES] == {"a": False, "b": True}
+    assert columns["a"].tolist() == [1, 2]
 
 
 class Fails(gym.Env[Any, Any]):

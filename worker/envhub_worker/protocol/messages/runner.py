@@ -205,14 +205,10 @@ class Revive(Message, kind=84):
     seeds: object
 
 
-class FetchInfosApart(Message, kind=85):
-    """Ask for the last infos as each sub-environment returned them. Reply: ``Value`` of triples.
-
-    ``failed``: the infos cannot be joined and their step has failed, so the reply holds none.
-    """
+class ForgetEnds(Message, kind=85):
+    """The infos of the last step cannot be joined: note no ended episode. Reply: ``Value``."""
 
     env: int
-    failed: bool = False
 
 
 class TakeApart(Message, kind=93):

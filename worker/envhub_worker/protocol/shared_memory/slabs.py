@@ -36,7 +36,6 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from envhub_worker.protocol.errors import FAULTS
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.shared_memory.words import *  # noqa: F403 - seen from outside as here
 from envhub_worker.protocol.shared_memory.words import HEADER_BYTES, INFO_BYTES, LINE, MAX_LEAVES
@@ -263,6 +262,8 @@ def flatten(space: gym.Space[Any], batch: Any) -> list[Any]:
 
 MAX_COLUMNS = 256
 _KINDS = frozenset("biuf")
+_NO_COLUMNS = frozenset({batches.APART_SCALARS, batches.APART_CLASSES})
+"""Keys that infos may have beside their columns, whose values stay the same from step to step."""
 
 
 @dataclass(frozen=True)
@@ -291,36 +292,13 @@ class Column:
         return np.ndarray(self.shape, dtype, buffer, start + self.offset)
 
 
-def own_infos(infos: dict[Any, Any]) -> list[dict[Any, Any]] | None:
-    """Returns each sub-environment's own infos; None if infos are joined or differ in form.
-
-    Two infos have the same form if they have the same keys, in the same order, and their values
-    have the same classes.
-    """
-    places = infos.keys() - {batches.APART_SCALARS}
-    if not places or places != set(range(len(places))):
-        return None
-    own = [infos[row] for row in range(len(places))]
-    if set(map(type, own)) != {dict}:
-        return None
-    forms = [[(key, type(value)) for key, value in info.items()] for info in own]
-    return own if all(form == forms[0] for form in forms) else None
-
-
 def columns_of(infos: dict[Any, Any]) -> tuple[Column, ...] | None:
-    """Returns the columns of flat, numeric infos in their order; None for other infos.
-
-    Infos that are not joined get the columns of the joined infos.
-    """
+    """Returns the columns of flat, numeric infos in their order; None for other infos."""
     columns: list[Column] = []
-    own = own_infos(infos)
-    if own is not None:
-        try:
-            infos = batches.join_pairs(list(enumerate(own)), len(own))
-        except FAULTS:
-            return None
     offset = 0
     for key, value in infos.items():
+        if type(key) is int and key in _NO_COLUMNS:
+            continue
         if type(key) is not str or type(value) is not np.ndarray or value.dtype.kind not in _KINDS:
             return None
         columns.append(Column(key, value.dtype, value.shape, offset))

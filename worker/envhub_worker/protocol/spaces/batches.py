@@ -18,7 +18,7 @@ from gymnasium.spaces.graph import GraphInstance
 from gymnasium.vector.utils import iterate
 
 from envhub_worker.protocol.codec.inert import inert_copy, one_line
-from envhub_worker.protocol.errors import FAULTS, MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.errors import FAULTS, MessageTooLargeError
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, OneOf
 
 Bounds = Sequence[tuple[int, int]]
@@ -142,25 +142,20 @@ def conforms(space: gym.Space[Any], batch: Any, count: int) -> bool:
     return all(conforms(sub, item, count) for sub, item in zip(space.spaces, batch, strict=True))
 
 
-class Misfit(RemoteProtocolError):
-    """The shards' infos do not join as columns: each sub-environment's own infos are needed."""
-
-
-APART: dict[Any, Any] = {None: None}
-"""Sent by a shard whose infos can be joined only together with those of the other shards."""
-
-
-def is_apart(infos: dict[Any, Any]) -> bool:
-    """Whether infos are marked ``APART``. Trust: the value may be anything."""
-    return len(infos) == 1 and infos.get(None, APART) is None
-
-
 APART_SCALARS = -1
 """The key of the result of ``integers``, in the unjoined infos of a single sub-environment."""
 
 
 APART_REWARD = -2
 """Likewise of a tuple with its reward, if that is not a number: a dict of agents, for example."""
+
+
+APART_FORMS = -3
+"""Likewise of ``forms_of`` each info that has forms, under the info's place."""
+
+
+APART_CLASSES = -4
+"""The key, in infos that are columns, of whether each column has numpy's numbers, not Python's."""
 
 
 def reward_misfit(reward: Any, index: int, shape: tuple[int, ...] = ()) -> str:
@@ -214,90 +209,58 @@ def as_returned(space: gym.Space[Any], member: Any, which: Iterator[bool]) -> An
     return _mapped(restored, space, member)
 
 
-def join_infos(
-    parts: Sequence[dict[Any, Any]], sizes: Sequence[int], max_bytes: int | None = None
-) -> dict[Any, Any]:
-    """Joins the infos of all shards as ``VectorEnv._add_info`` would have built them at once.
-
-    The first sub-environment that has a key determines the column's dtype, and each shard has its
-    own first. If these dtypes agree, the shards' arrays are parts of the whole column.
-
-    Args:
-        max_bytes: How much larger than the parts the whole may be: one row makes a long column.
-
-    Raises:
-        Misfit: The dtypes differ, or the values are no infos; ask for each sub-environment's own.
+def own_infos(pairs: Pairs, count: int, forms: Sequence[Forms] = ()) -> dict[Any, Any]:
+    """The infos of a shard's ``count`` sub-environments, which are not joined: under its index, or
+    plus ``count`` if it has an info already, because its episode ended in the same step.
     """
-    joined: dict[Any, Any] = {}
-    if not any(parts):
-        return joined
-    starts = np.cumsum([0, *sizes]).tolist()
-    room = _Room(parts, max_bytes)
-    for part, start, size in zip(parts, starts, sizes, strict=False):
-        try:
-            _join_part(joined, part, slice(start, start + size), starts[-1], room)
-        except FAULTS as error:
-            raise Misfit(f"the shards' infos do not fit together: {error}") from error
-    return joined
+    infos: dict[Any, Any] = {}
+    own_forms: Forms = {}
+    for (index, info), form in zip(pairs, forms or itertools.repeat(_NO_FORMS), strict=False):
+        place = index + count if index in infos else index
+        infos[place] = info
+        if form:
+            own_forms[place] = form
+    if own_forms:
+        infos[APART_FORMS] = own_forms
+    return infos
 
 
-class _Room:
-    """The remaining bytes for columns of joined infos: see ``join_infos``."""
+def flat_infos(pairs: Pairs, count: int) -> dict[Any, Any] | None:
+    """A shard's infos as columns, if these lose nothing: each sub-environment has the same keys, in
+    the same order, and the numbers of a key have one class. Otherwise None.
+    """
+    first = pairs[0][1] if pairs else {}
+    keys, classes = list(first), list(map(type, first.values()))
+    if not keys or not _NUMBERS.issuperset(classes) or len(pairs) != count:
+        return None
+    for index, (place, info) in enumerate(pairs):
+        if place != index or list(info) != keys or list(map(type, info.values())) != classes:
+            return None
+    try:
+        infos = join_pairs(pairs, count)
+    except FAULTS:  # an integer beyond 64 bit
+        return None
+    is_plain = all(type(key) is str for key in keys) and len(infos) == 2 * len(keys)
+    if not is_plain or "final_obs" in infos:  # a key is another's mask, or its column is of objects
+        return None
+    are_numpys = [issubclass(kind, np.generic) for kind in classes]
+    return {**infos, APART_CLASSES: dict(zip(keys, are_numpys, strict=True))}
 
-    def __init__(self, parts: Sequence[dict[Any, Any]], max_bytes: int | None) -> None:
-        self._parts, self._max_bytes, self._taken, self._own = parts, max_bytes, 0, 0
 
-    def take(self, value: Any, count: int) -> None:
-        """Spends the bytes of a column before it is made."""
-        self._taken += value.nbytes * count // len(value)
-        most = self._max_bytes
-        if most is not None and self._taken > most:
-            self._own = self._own or _bytes(*self._parts)
-        if most is not None and self._taken > most + self._own:
-            raise ValueError(f"they take more than {most} bytes beyond their own")
-
-
-def _bytes(*parts: dict[Any, Any]) -> int:
+def _bytes(*infos: dict[Any, Any]) -> int:
     """Total size of the arrays in infos."""
-    values = [value for part in parts for value in part.values()]
+    values = [value for info in infos for value in info.values()]
     nested = _bytes(*(value for value in values if isinstance(value, dict))) if values else 0
     return nested + sum(value.nbytes for value in values if isinstance(value, np.ndarray))
-
-
-def _join_part(
-    joined: dict[Any, Any], part: dict[Any, Any], window: slice, count: int, room: _Room
-) -> None:
-    passed: set[Any] = set()
-    for key, value in part.items():
-        passed.add(key)
-        if type(key) is int and f"_{key}" not in part:
-            raise ValueError("an entry has no mask")
-        if isinstance(value, dict):
-            _join_part(joined.setdefault(key, {}), value, window, count, room)
-            continue
-        size = window.stop - window.start
-        if len(value) != size:  # or its other dimensions cost nothing
-            raise ValueError("an entry does not have one value per sub-environment")
-        # A mask in front of its column is the mark of join_slice.
-        if value.dtype == object and f"_{key}" in passed and f"__{key}" not in part:
-            raise ValueError("an entry is 0 where other shards may have None")
-        array = joined.get(key)
-        if array is None:
-            room.take(value, count)
-            array = joined[key] = _blank(value, count)
-        if (array.dtype, array.shape[1:]) != (value.dtype, value.shape[1:]):
-            raise ValueError("an entry is of another dtype or shape in another shard")
-        array[window] = value
 
 
 def gather_infos(
     parts: Sequence[dict[Any, Any]], sizes: Sequence[int], max_bytes: int
 ) -> dict[Any, Any]:
-    """Like ``join_infos``, but no part converts another's values.
+    """Joins the joined infos of several workers, none of which converts another's values.
 
     An entry becomes an object array of each sub-environment's own values if its dtype, shape or
     kind differs between parts, or if its column would take more than ``max_bytes``.
-    Each part must have passed ``check_infos``.
     """
     joined: dict[Any, Any] = {}
     start, count = 0, sum(sizes)
@@ -305,15 +268,6 @@ def gather_infos(
         _gather_part(joined, part, slice(start, start + size), count, max_bytes)
         start += size
     return joined
-
-
-def check_infos(part: dict[Any, Any], size: int) -> None:
-    """Raises ``Misfit`` unless ``infos`` are infos of ``count`` sub-environments."""
-    for value in part.values():
-        if isinstance(value, dict):
-            check_infos(value, size)
-        elif type(value) is not np.ndarray or value.shape[:1] != (size,):
-            raise Misfit("an entry of the infos does not have one value per sub-environment")
 
 
 def _gather_part(
@@ -386,9 +340,11 @@ Pairs = Sequence[tuple[int, dict[Any, Any]]]
 """Infos with the index of their sub-environment, in the order in which they came."""
 Column = Callable[[Any, int], Any]
 _SCALARS = frozenset({int, float, bool})
+_NUMBERS = _SCALARS | {np.dtype(char).type for char in "bBhHiIlLqQefd"}
+"""Classes whose values lose nothing in an array of their dtype, but which of them they had."""
 _NO_FORMS: Forms = {}
 _NO_FORM: tuple[str, bool, Forms] = ("", False, _NO_FORMS)
-_SAME = _SCALARS | {str, bytes, type(None), list, tuple, dict, np.ndarray, np.bool_}
+_SAME = _NUMBERS | {str, bytes, type(None), list, tuple, dict, np.ndarray, np.bool_}
 """Values of these classes are joined alike on both sides."""
 
 
@@ -421,21 +377,27 @@ def join_pairs(
     Args:
         pairs: Each sub-environment's index and its infos.
         count: Number of sub-environments.
-        max_bytes: Maximum size of all columns together: a few bytes make a large column.
+        max_bytes: How much larger than the infos their columns may be: a few bytes make a large
+            column.
         forms: For each of the pairs, the result of ``forms_of`` in the process that sent it.
 
     Raises:
         Exception: Whatever Gymnasium would raise, with the key in front.
         MessageTooLargeError: The columns would take more than ``max_bytes``.
     """
-    left = max_bytes
+    left, own_bytes = max_bytes, 0
 
     def column(value: Any, count: int) -> Any:
-        nonlocal left
+        nonlocal left, own_bytes
         if left is not None:
             left -= count * max(np.dtype(np.float64).itemsize, getattr(value, "nbytes", 0))
+            if left < 0 and not own_bytes:  # counted once, and seldom
+                own_bytes = 1 + _bytes(*(info for _, info in pairs))
+                left += own_bytes
             if left < 0:
-                raise MessageTooLargeError(f"joined infos take more than {max_bytes} bytes")
+                raise MessageTooLargeError(
+                    f"joined infos take more than {max_bytes} bytes beyond their own"
+                )
         return blank_column(value, count)
 
     infos: dict[Any, Any] = {}
@@ -443,37 +405,6 @@ def join_pairs(
     for (index, info), own in zip(pairs, forms or itertools.repeat(_NO_FORMS), strict=False):
         add_info(infos, info, index, count, make, own)
     return infos
-
-
-def join_slice(pairs: Pairs, count: int) -> dict[Any, Any]:
-    """Joins the infos of a shard's sub-environments like ``join_pairs``.
-
-    In a column of objects a row without the entry is 0 if the first value is a zero-dimensional
-    object array, else None. Another shard's row may be the first, which this shard cannot see. It
-    therefore puts the mask of such a column before the column, and ``join_infos`` raises ``Misfit``
-    when it meets a mask in front.
-    """
-    zeros: list[Any] = []
-
-    def column(value: Any, count: int) -> Any:
-        array = blank_column(value, count)
-        if array.dtype == object and isinstance(value, np.ndarray) and not value.ndim:
-            zeros.append(array)
-        return array
-
-    infos: dict[Any, Any] = {}
-    for index, info in pairs:
-        add_info(infos, info, index, count, column)
-    return _masks_first(infos, zeros) if zeros else infos
-
-
-def _masks_first(infos: dict[Any, Any], columns: list[Any]) -> dict[Any, Any]:
-    ordered: dict[Any, Any] = {}
-    for key, value in infos.items():
-        if any(value is column for column in columns):
-            ordered[f"_{key}"] = infos[f"_{key}"]
-        ordered[key] = _masks_first(value, columns) if isinstance(value, dict) else value
-    return ordered
 
 
 def add_info(
