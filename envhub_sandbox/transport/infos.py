@@ -54,25 +54,40 @@ def joined(each: OwnInfos, max_bytes: int) -> Infos:
 
 def _columns_of_all(parts: Sequence[Infos], sizes: Sequence[int]) -> Infos | None:
     classes = parts[0].get(batches.APART_CLASSES)
-    if classes is None:
+    if classes is None or any(part.get(batches.APART_CLASSES) != classes for part in parts):
         return None
-    _refuse_unless(type(classes) is dict, "of a known form")
+    columns = [{key: part[key] for key in part if key != batches.APART_CLASSES} for part in parts]
+    joined = _joined_columns(columns, sizes, classes)
+    return None if joined is None else {batches.APART_CLASSES: classes, **joined}
+
+
+def _joined_columns(parts: Sequence[Infos], sizes: Sequence[int], classes: Any) -> Infos | None:
+    _refuse_unless(all(type(each) is dict for each in (classes, *parts)), "of a known form")
     keys = [*parts[0]]
-    names = {name for key in classes for name in (key, f"_{key}")}
-    if {*keys} != names | {batches.APART_CLASSES}:  # there are marks
+    if {*keys} != {name for key in classes for name in (key, f"_{key}")}:  # there are marks
         return None
-    for part, size in zip(parts, sizes, strict=True):
-        if [*part] != keys or part[batches.APART_CLASSES] != classes:
+    if any([*part] != keys for part in parts):
+        return None
+    joined: Infos = {}
+    for key in keys:
+        values = [part[key] for part in parts]
+        if key not in classes:
+            joined[key] = np.ones(sum(sizes), np.bool_)
+        elif type(classes[key]) is dict:
+            joined[key] = _joined_columns(values, sizes, classes[key])
+        else:
+            joined[key] = _joined_column(values, sizes)
+        if joined[key] is None:
             return None
-        for key in classes:
-            _refuse_unless_column(part[key], size)
-            if part[key].dtype != parts[0][key].dtype:
-                return None
-    columns: Infos = {batches.APART_CLASSES: classes}
-    for key in filter(names.__contains__, keys):
-        each = [part[key] for part in parts]
-        columns[key] = np.concatenate(each) if key in classes else np.ones(sum(sizes), np.bool_)
-    return columns
+    return joined
+
+
+def _joined_column(parts: Sequence[Any], sizes: Sequence[int]) -> Any:
+    for part, size in zip(parts, sizes, strict=True):
+        _refuse_unless_column(part, size)
+    first = parts[0]
+    is_alike = all((part.dtype, part.shape[1:]) == (first.dtype, first.shape[1:]) for part in parts)
+    return np.concatenate(parts) if is_alike else None
 
 
 def each_of(part: Infos, size: int) -> OwnInfos:
@@ -92,30 +107,41 @@ def each_of(part: Infos, size: int) -> OwnInfos:
     return own
 
 
-def _rows(part: Infos, classes: Infos, size: int) -> list[Infos]:
-    columns = []
-    for key, has_numpys in classes.items():
-        _refuse_unless_column(part.get(key), size)
-        columns.append(list(part[key]) if has_numpys else part[key].tolist())
+def _rows(part: Any, classes: Infos, size: int) -> list[Infos]:
+    _refuse_unless(type(part) is dict, "of a known form")
+    columns = [_members(part.get(key), has_numpys, size) for key, has_numpys in classes.items()]
     return [dict(zip(classes, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
+def _members(column: Any, has_numpys: Any, size: int) -> Any:
+    if type(has_numpys) is dict:
+        return _rows(column, has_numpys, size)
+    _refuse_unless_column(column, size)
+    return list(column) if has_numpys else column.tolist()
+
+
 def _refuse_unless_column(value: Any, size: int) -> None:
-    is_column = type(value) is np.ndarray and value.shape == (size,)
-    _refuse_unless(is_column and value.dtype.kind in _NUMBERS, "one number each")
+    is_column = type(value) is np.ndarray and value.shape[:1] == (size,)
+    _refuse_unless(is_column and value.dtype.kind in _NUMBERS, "one value each")
 
 
 def _add_marks(own: OwnInfos, part: Infos, classes: Infos, size: int) -> None:
+    marks: list[Infos] = [{} for _ in own]
     for key in part:
         if type(key) is int:
             continue
         is_mask = type(key) is str and key[:1] == "_" and key[1:] in part
         _refuse_unless(is_mask or (type(key) is str and f"_{key}" in part), "one mapping each")
         if not is_mask and key not in classes:
-            _refuse_unless_column(part[f"_{key}"], size)
-            for index in np.flatnonzero(part[f"_{key}"]):
-                *others, (info, form) = own[index] or [({}, {})]
-                own[index] = [*others, ({**info, key: True}, form)]
+            mask = part[f"_{key}"]
+            _refuse_unless_column(mask, size)
+            _refuse_unless(mask.ndim == 1, "one value each")
+            for row in np.flatnonzero(mask):
+                marks[row][key] = True
+    for index, mark in enumerate(marks):
+        if mark:
+            *others, (info, form) = own[index] or [({}, {})]
+            own[index] = [*others, ({**info, **mark}, form)]
 
 
 def _refuse_unless(holds: bool, claim: str) -> None:

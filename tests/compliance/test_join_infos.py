@@ -55,6 +55,8 @@ def sent(infos: list[dict[str, Any]]) -> dict[Any, Any]:
 
 
 NUMBERS = st.sampled_from([1, 2, 0.5, True, 2**60 + 1, np.int64(300), np.int8(3), np.float32(0.1)])
+ARRAYS = st.sampled_from([np.ones(2), np.ones(2, np.int8), np.ones((2, 1)), np.ones((0, 2))])
+ALIKE = st.fixed_dictionaries({"array": ARRAYS, "inner": st.fixed_dictionaries({"n": NUMBERS})})
 NUMBER = st.fixed_dictionaries({"number": NUMBERS})
 ANY = st.sampled_from([1, 0.5, "text", None, np.float64(0.1), np.array(None), np.ones(2), {}])
 UNLIKE = st.tuples(INFO, st.fixed_dictionaries({}, optional={"number": NUMBERS, "any": ANY}))
@@ -62,7 +64,8 @@ UNLIKE = st.tuples(INFO, st.fixed_dictionaries({}, optional={"number": NUMBERS, 
 
 @given(
     st.lists(NUMBER | UNLIKE.map(lambda two: two[0] | two[1]), min_size=2, max_size=6)
-    | st.lists(NUMBER, min_size=2, max_size=6),
+    | st.lists(NUMBER, min_size=2, max_size=6)
+    | st.lists(ALIKE, min_size=2, max_size=6),
     st.data(),
 )
 def test_shards_join_as_one_batch(infos: list[dict[str, Any]], data: st.DataObject) -> None:

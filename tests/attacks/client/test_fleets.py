@@ -2,6 +2,7 @@
 It may end what it serves, which costs the caller an error. The rows of the others are as they were,
 and their workers go on."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -138,6 +139,13 @@ OWN: dict[str, dict[Any, Any]] = {
     "in columns of all rows": {"a": np.zeros(ALL), "_a": 1, batches.APART_CLASSES: _PLAIN},
     "in columns of no numbers": {"a": np.full(2, None), "_a": 1, batches.APART_CLASSES: _PLAIN},
     "in columns that are missing": {batches.APART_CLASSES: _PLAIN},
+    "in nested columns of none": {"a": 5, "_a": 1, batches.APART_CLASSES: {"a": _PLAIN}},
+    "in nested columns of all rows": {
+        "b": {"a": np.zeros(ALL), "_a": 1},
+        "_b": 1,
+        batches.APART_CLASSES: {"b": _PLAIN},
+    },
+    "with a mask of two dimensions": {"x": np.ones(2), "_x": np.ones((NUM_ENVS, 1), bool)},
     "in columns of no class": {"a": np.zeros(NUM_ENVS), "_a": 1, batches.APART_CLASSES: ["a"]},
 }
 
@@ -168,6 +176,21 @@ def test_own_infos_that_would_take_too_much_are_refused() -> None:
     with pytest.raises(errors.RemoteEnvError) as caught:
         joins.infos([{0: {name: 1.0}}, {0: {name: "text"}}])
     assert len(str(caught.value)) < 1000
+
+
+def test_many_marks_take_no_longer_each_than_few() -> None:
+    """Else a message within the limits would keep the client busy for minutes."""
+    joins = Results(wire.env_manifest(OBSERVATION, ACTION, 64, sync=True), [(0, 1), (1, 64)])
+    mask = np.ones(1, bool)
+
+    def cost(count: int) -> float:
+        names = [f"{sign}{number}" for number in range(count) for sign in ("m", "_m")]
+        infos = dict.fromkeys(names, mask)
+        begun = time.thread_time()
+        joins.infos([infos, {}])
+        return time.thread_time() - begun
+
+    assert min(cost(32_000) for _ in range(3)) < 60 * min(cost(2000) for _ in range(3))
 
 
 def test_infos_that_came_apart_are_of_its_own_rows_alone() -> None:

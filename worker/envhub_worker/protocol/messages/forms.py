@@ -151,7 +151,7 @@ def _template(value: Any, notes: Iterator[tuple[Array, bytes]]) -> Any:
     kind = type(value)
     if kind in _CONSTANTS:
         return value
-    if kind is dict and not set(map(type, value)) - {str}:
+    if kind is dict and {int, str}.issuperset(map(type, value)):
         return {key: _template(item, notes) for key, item in value.items()}
     if kind is tuple or kind is list:
         return kind([_template(item, notes) for item in value])

@@ -155,7 +155,7 @@ APART_FORMS = -3
 
 
 APART_CLASSES = -4
-"""The key, in infos that are columns, of whether each column has numpy's numbers, not Python's."""
+"""The key, in infos that are columns, of whether each has numpy's values, not Python's."""
 
 
 def reward_misfit(reward: Any, index: int, shape: tuple[int, ...] = ()) -> str:
@@ -226,25 +226,40 @@ def own_infos(pairs: Pairs, count: int, forms: Sequence[Forms] = ()) -> dict[Any
 
 
 def flat_infos(pairs: Pairs, count: int) -> dict[Any, Any] | None:
-    """A shard's infos as columns, if these lose nothing: each sub-environment has the same keys, in
-    the same order, and the numbers of a key have one class. Otherwise None.
-    """
-    first = pairs[0][1] if pairs else {}
-    keys, classes = list(first), list(map(type, first.values()))
-    if not keys or not _NUMBERS.issuperset(classes) or len(pairs) != count:
+    """A shard's infos as columns, with their classes, if these lose nothing. Otherwise None."""
+    if [index for index, _ in pairs] != list(range(count)):
         return None
-    for index, (place, info) in enumerate(pairs):
-        if place != index or list(info) != keys or list(map(type, info.values())) != classes:
-            return None
+    classes = _classes_of([info for _, info in pairs])
     try:
-        infos = join_pairs(pairs, count)
+        return classes and {**join_pairs(pairs, count), APART_CLASSES: classes}
     except FAULTS:  # an integer beyond 64 bit
         return None
-    is_plain = all(type(key) is str for key in keys) and len(infos) == 2 * len(keys)
-    if not is_plain or "final_obs" in infos:  # a key is another's mask, or its column is of objects
+
+
+def _classes_of(infos: Sequence[Any]) -> dict[Any, Any] | None:
+    """For each key whether its values are numpy's, not Python's, or the same of nested infos. None
+    if infos have other keys, or in another order, or if a key's values make no such column.
+    """
+    first = infos[0]
+    if any(list(info) != list(first) or {*map(type, info)} != {str} for info in infos):
         return None
-    are_numpys = [issubclass(kind, np.generic) for kind in classes]
-    return {**infos, APART_CLASSES: dict(zip(keys, are_numpys, strict=True))}
+    if "final_obs" in first or any(f"_{key}" in first for key in first):
+        return None  # a column of objects, or a key that is another's mask
+    classes = {key: _class_of([info[key] for info in infos]) for key in first}
+    return None if None in classes.values() else classes
+
+
+def _class_of(values: Sequence[Any]) -> Any:
+    kind, first = type(values[0]), values[0]
+    if {*map(type, values)} != {kind}:
+        return None
+    if kind is dict:
+        return _classes_of(values)
+    if kind is not np.ndarray:
+        return issubclass(kind, np.generic) if kind in _NUMBERS else None
+    is_plain = first.ndim and first.dtype.isnative and first.dtype.type in _NUMBERS | {np.bool_}
+    is_alike = {(value.dtype, value.shape) for value in values} == {(first.dtype, first.shape)}
+    return True if is_plain and is_alike else None
 
 
 def _bytes(*infos: dict[Any, Any]) -> int:
