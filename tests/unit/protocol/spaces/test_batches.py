@@ -164,11 +164,14 @@ def test_lies_about_members_are_left_as_they_are(name: str, member: object) -> N
 
 
 def test_few_bytes_make_no_large_column() -> None:
-    """One value of each sub-environment is as long as the first one's, and is counted so; what all
-    have sent is joined, whatever it takes."""
+    """One value of each sub-environment is as long as the first one's, and is counted so, as masks
+    and final observations are; what all have sent is joined, whatever it takes."""
     row = np.zeros(1000, np.uint8)
+    for small in ({str(key): {} for key in range(9)}, {"a": {"final_obs": 0}}):
+        with pytest.raises(MessageTooLargeError, match="more than 1500 bytes"):
+            batches.join_pairs([(0, small)], 64, 1500)
     for info in ({"a": row}, {"x": {"a": row}}):
-        assert batches.join_pairs([(index, info) for index in range(64)], 64, 100).keys()
+        assert batches.join_pairs([(index, info) for index in range(64)], 64, 1100).keys()
         assert batches.join_pairs([(0, info)], 3, 2100).keys()
         with pytest.raises(MessageTooLargeError, match="more than 1900 bytes"):
             batches.join_pairs([(0, info)], 3, 1900)

@@ -436,9 +436,7 @@ def add_info(
         mask_key, is_object, inner = forms.get(key, _NO_FORM) if forms else _NO_FORM
         try:
             if key == "final_obs":
-                array = infos.get(key)
-                if array is None:
-                    array = np.full(count, None, dtype=object)
+                array = infos[key] if key in infos else column(None, count)
                 array[index] = value
             elif isinstance(value, dict) and not is_object:
                 array = add_info(infos.get(key, {}), value, index, count, column, inner)
@@ -449,7 +447,7 @@ def add_info(
             mask_key = mask_key or f"_{key}"
             mask = infos.get(mask_key)
             if mask is None:
-                mask = np.zeros(count, np.bool_)
+                mask = column(True, count)
             mask[index] = True
             infos[key], infos[mask_key] = array, mask
         except FAULTS as error:
