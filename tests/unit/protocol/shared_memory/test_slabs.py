@@ -99,8 +99,9 @@ def test_a_step_is_its_arrays() -> None:
     assert observed.batch_bytes == 4 * (60 + 8 + 7 + 8 + 8 + 1 + 1)
 
 
-@pytest.mark.parametrize("kind", ["O", "U3", "S3", "M8[s]", "V8"])
+@pytest.mark.parametrize("kind", ["O", "U3", "S3", "M8[s]", "V8", "g", ">i4"])
 def test_only_numbers_have_columns(kind: str) -> None:
-    """An array of objects over memory that a jail writes would be pointers of its choice."""
+    """An array of objects over memory that a jail writes would be pointers of its choice, and what
+    is sent in another dtype would be read in that."""
     assert slabs.columns_of({"a": np.zeros(2)})
     assert slabs.columns_of({"a": np.zeros(2), "b": np.zeros(2, kind)}) is None

@@ -36,6 +36,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from envhub_worker.protocol.codec.arrays import NUMBERS
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.shared_memory.words import *  # noqa: F403 - seen from outside as here
 from envhub_worker.protocol.shared_memory.words import HEADER_BYTES, INFO_BYTES, LINE, MAX_LEAVES
@@ -299,7 +300,9 @@ def columns_of(infos: dict[Any, Any]) -> tuple[Column, ...] | None:
     for key, value in infos.items():
         if type(key) is int and key in _NO_COLUMNS:
             continue
-        if type(key) is not str or type(value) is not np.ndarray or value.dtype.kind not in _KINDS:
+        if type(key) is not str or type(value) is not np.ndarray:
+            return None
+        if value.dtype.kind not in _KINDS or value.dtype not in NUMBERS:  # sent in another dtype
             return None
         columns.append(Column(key, value.dtype, value.shape, offset))
         offset += -(-math.prod(value.shape) * value.dtype.itemsize // LINE) * LINE
