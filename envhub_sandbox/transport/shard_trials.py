@@ -7,11 +7,12 @@ all other state that a process has once. So a synchronous environment has one pr
 (``runner/independence.py``), this module may choose another number, which changes no result.
 
 Each use of a pin cuts its sub-environments into shards in one way, and notes the time of a step.
-The first uses try each way twice; later uses take the fastest. If fewer shards are nearly as fast,
-they win, because they take less memory and start sooner. Other processes only ever slow steps down,
-so the time of a way is the shortest of its last uses. A load that lasts may make another way the
-fastest. So after several slow uses in a row, all earlier ones are forgotten, and all ways are tried
-again; likewise if the number of cores changes, or if the last use of a way is long ago.
+The first uses try each way, and a second time what was not far slower; later uses take the fastest.
+If fewer shards are nearly as fast, they win, because they take less memory and start sooner. Other
+processes only ever slow steps down, so the time of a way is the shortest of its last uses. A load
+that lasts may make another way the fastest. So after several slow uses in a row, all earlier ones
+are forgotten, and all ways are tried again; likewise if the number of cores changes, or if the last
+use of a way is long ago.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ HOPELESS = 1.2
 """If half as many shards are slower than the best by this factor, fewer are not tried."""
 _TRIALS = 2
 """The least number of times to try each way."""
-_NOISE = 2.0
+_NOISE = 1.3
 """A way that seemed slower by more than this factor is not tried a second time."""
 _LOADED = 1.5
 """A use is slow if its steps took longer than the shortest of the same way by this factor."""

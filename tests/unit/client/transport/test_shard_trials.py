@@ -54,7 +54,9 @@ def use(path: Path, times: Mapping[str, float], count: int = 16) -> str:
     ],
 )
 def test_the_fastest_of_all_is_used(path: Path, times: dict[str, float], expected: str) -> None:
-    assert [use(path, times) for _ in range(6)] == 2 * list(times)
+    assert [use(path, times) for _ in range(3)] == list(times)
+    near = [name for name, step_s in times.items() if step_s < 1.3 * min(times.values())]
+    assert [use(path, times) for _ in near] == near
     assert {use(path, times) for _ in range(5)} == {expected}
 
 
@@ -62,7 +64,7 @@ def test_fewer_are_not_tried_if_half_is_slower(path: Path, monkeypatch: pytest.M
     """A use that is many times as slow would be a high price for what is known already."""
     cores(monkeypatch, 8)
     tried = ["1+1+1+1+1+1+1+1", "2+1+1+1+1+1+1", "2+2+2+2"]
-    times = dict(zip(tried, (16e-3, 36e-3, 36e-3), strict=True))
+    times = dict(zip(tried, (16e-3, 32e-3, 32e-3), strict=True))
     assert [use(path, times, 8) for _ in range(5)] == [*tried, tried[0], tried[0]]
 
 
