@@ -16,12 +16,17 @@ from typing import Any
 import numpy as np
 
 from envhub_sandbox.errors import RemoteProtocolError
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.spaces import batches
 
 Infos = dict[Any, Any]
 OwnInfos = list[list[tuple[Infos, batches.Forms]]]
 """Each sub-environment's infos, in order, with their forms."""
 _NUMBERS = frozenset("biuf")
+_MOST_BYTES = DEFAULT_LIMITS.message_bytes
+"""What infos of one shard may take here beyond the arrays that brought them, which may be empty."""
+_VALUE_BYTES = 256
+"""What one value takes as an object in a dict of its own."""
 
 
 def read(parts: Sequence[Infos], sizes: Sequence[int]) -> tuple[Infos | None, OwnInfos]:
@@ -56,6 +61,7 @@ def _columns_of_all(parts: Sequence[Infos], sizes: Sequence[int]) -> Infos | Non
     classes = parts[0].get(batches.APART_CLASSES)
     if classes is None or any(part.get(batches.APART_CLASSES) != classes for part in parts):
         return None
+    _refuse_unless(_count(classes) * sum(sizes) <= _MOST_BYTES, "few enough")  # a mask for each
     columns = [{key: part[key] for key in part if key != batches.APART_CLASSES} for part in parts]
     joined = _joined_columns(columns, sizes, classes)
     return None if joined is None else {batches.APART_CLASSES: classes, **joined}
@@ -95,6 +101,7 @@ def each_of(part: Infos, size: int) -> OwnInfos:
     own: OwnInfos = [[] for _ in range(size)]
     classes, forms = part.get(batches.APART_CLASSES, {}), part.get(batches.APART_FORMS, {})
     _refuse_unless(type(classes) is type(forms) is dict, "of a known form")
+    _refuse_unless(_count(classes) * size * _VALUE_BYTES <= _MOST_BYTES, "few enough")
     if classes:
         for some, row in zip(own, _rows(part, classes, size), strict=True):
             some.append((row, {}))
@@ -107,6 +114,10 @@ def each_of(part: Infos, size: int) -> OwnInfos:
     return own
 
 
+def _count(classes: Any) -> int:
+    return sum(map(_count, classes.values())) if type(classes) is dict else 1
+
+
 def _rows(part: Any, classes: Infos, size: int) -> list[Infos]:
     _refuse_unless(type(part) is dict, "of a known form")
     columns = [_members(part.get(key), has_numpys, size) for key, has_numpys in classes.items()]
@@ -117,7 +128,10 @@ def _members(column: Any, has_numpys: Any, size: int) -> Any:
     if type(has_numpys) is dict:
         return _rows(column, has_numpys, size)
     _refuse_unless_column(column, size)
-    return list(column) if has_numpys else column.tolist()
+    if has_numpys:
+        return list(column)
+    _refuse_unless(column.ndim == 1, "one value each")  # Python's numbers are in no arrays
+    return column.tolist()
 
 
 def _refuse_unless_column(value: Any, size: int) -> None:
@@ -127,12 +141,15 @@ def _refuse_unless_column(value: Any, size: int) -> None:
 
 def _add_marks(own: OwnInfos, part: Infos, classes: Infos, size: int) -> None:
     marks: list[Infos] = [{} for _ in own]
+    marked = 0
     for key in part:
         if type(key) is int:
             continue
         is_mask = type(key) is str and key[:1] == "_" and key[1:] in part
         _refuse_unless(is_mask or (type(key) is str and f"_{key}" in part), "one mapping each")
         if not is_mask and key not in classes:
+            marked += size
+            _refuse_unless(marked * _VALUE_BYTES <= _MOST_BYTES, "few enough")
             mask = part[f"_{key}"]
             _refuse_unless_column(mask, size)
             _refuse_unless(mask.ndim == 1, "one value each")

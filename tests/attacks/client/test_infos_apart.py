@@ -11,10 +11,20 @@ import numpy as np
 import pytest
 
 from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.transport.results import Results
 from envhub_sandbox.vector.single_env import SingleEnv
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
-from tests.attacks.client.lies import Canary, opened, pickled, refuses, relayed
+from envhub_worker.protocol.spaces import batches
+from tests.attacks.client.lies import (
+    GROWTH,
+    Canary,
+    opened,
+    peak_growth,
+    pickled,
+    refuses,
+    relayed,
+)
 from tests.attacks.client.lying_server import ACTION, OBSERVATION, LyingServer
 from tests.support import wire
 
@@ -74,6 +84,41 @@ def test_infos_of_another_form_are_refused(liar: LyingServer, folder: str, what:
         action = env.action_space.sample()
         liar.lies[m.Step] = relayed(_done(LIES[what]))
         assert isinstance(refuses(lambda: env.step(action)), RemoteProtocolError)
+
+
+COUNT = 512
+"""Sub-environments of a shard among two, each of which sends its infos as columns."""
+
+
+def _columns(keys: int, value: np.ndarray, *, is_numpys: bool = True) -> dict[Any, Any]:
+    names = list(map(str, range(keys)))
+    masks = {f"_{name}": None for name in names}
+    classes = dict.fromkeys(names, is_numpys)
+    return {**dict.fromkeys(names, value), **masks, batches.APART_CLASSES: classes}
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [
+        _columns(30_000, np.zeros((COUNT, 0))),
+        _columns(1, np.zeros((COUNT, 30_000), np.int8), is_numpys=False),
+        {f"{mark}{key}": np.ones(COUNT, bool) for key in range(3_000) for mark in ("", "_")},
+    ],
+    ids=["empty arrays", "numbers of Python", "marks"],
+)
+def test_columns_take_no_more_memory_than_their_message_may(lie: dict[Any, Any]) -> None:
+    """In the client each value of a row is an object. The control is joined."""
+    count = 2 * COUNT
+    described = wire.env_manifest(OBSERVATION, ACTION, count)
+    results = Results(described, [(0, COUNT), (COUNT, count)])
+    honest = results.infos([_columns(3, np.zeros((COUNT, 2))), {}])
+    assert honest["0"].shape == (count, 2)
+
+    def read() -> None:
+        with pytest.raises(RemoteProtocolError, match="infos are not"):
+            results.infos([lie, {}])
+
+    assert peak_growth(read) < GROWTH
 
 
 def test_a_last_observation_that_is_missing_is_refused(liar: LyingServer, folder: str) -> None:
