@@ -80,6 +80,10 @@ def packages(real_index: Index) -> Index:
     asked = asked.replace("plugin", "asked")
     make_wheel(folder, "asked", files={"asked/__init__.py": asked, "asked/envs.py": MAZE})
     make_wheel(folder, "no-envs", files={"no_envs.py": "from gymnasium import register"})
+    optional = (
+        "try:\n    import gym\nexcept ImportError:\n    pass\nelse:\n    gym.register('A-v0')\n"
+    )
+    make_wheel(folder, "needs-gym", files={"needs_gym.py": optional})
     return real_index
 
 
@@ -140,6 +144,8 @@ def test_an_id_that_is_not_there(packages: Index) -> None:
     assert "CartPole" not in str(caught.value)
     with pytest.raises(LoadError, match="registers no environment with Gymnasium"):
         make_env("pypi:no-envs#Walled/Maze-v2")
+    with pytest.raises(LoadError, match=r"but with gym,(?s:.*)\{'extra': \['gym'\]\}"):
+        make_env("pypi:needs-gym#A-v0")
     with pytest.raises(LoadError, match=r"gymnasium [\d.]+ registers no environment") as caught:
         make_env("pypi:gymnasium#CartPole-v9")  # whose ids are there from the start
     assert "CartPole-v1" in str(caught.value)

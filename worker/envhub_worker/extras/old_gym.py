@@ -345,6 +345,8 @@ def explained(error: Exception, env: Any, method: str) -> Exception:
     message = f"{_where(env.unwrapped, method)} does not return {_RETURNS[method]}"
     if "got 4" in text or (method == "reset" and "non-iterable" not in text):
         message = f"{message}. That is the API before Gymnasium 0.26; see {_GUIDE}"
+        if is_env(env.unwrapped):
+            message = f"{message}. It may run as it is with: pip install 'gym<0.26'"
     return returned.raised_at(type(error)(f"{message} ({text})"), env, method)
 
 

@@ -185,6 +185,22 @@ def test_an_attribute_is_set_where_it_is() -> None:
     assert "gain" not in vars(adapted)
 
 
+def test_a_step_that_a_later_gym_refuses_names_the_earlier() -> None:
+    """Not for a class of Gymnasium, which has no earlier release with that API."""
+
+    theirs: dict[str, Any] = {}
+    step = "def step(self, action):\n    return None, 0.0, False, {}\n"
+    exec(compile(step, "envs.py", "exec"), theirs)
+    members = {"step": theirs["step"], "unwrapped": property(lambda env: env)}
+    wrapper = compile("_, _, _, _, _ = env.step(0)", "gym/wrappers.py", "exec")
+    for base, named in ((Env, True), (object, False)):
+        env = type("Four", (base,), members)()
+        with pytest.raises(ValueError, match="expected 5, got 4") as caught:
+            exec(wrapper, {"env": env})
+        told = old_gym.explained(caught.value, env, "step")
+        assert ("pip install 'gym<0.26'" in str(told)) == named
+
+
 def test_what_is_gymnasiums_stays_as_it_is(recwarn: Any) -> None:
     env = gymnasium.make("CartPole-v1")
     assert old_gym.adapted(env) is env
