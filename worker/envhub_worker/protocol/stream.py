@@ -129,6 +129,19 @@ class StreamReader:
         missing = 0 if self._body is None else self._body.nbytes - self._filled
         return min(max(missing, _SMALL_CHUNK), _LARGE_CHUNK)
 
+    @property
+    def room(self) -> memoryview | None:
+        """Where the next bytes belong, if a packet has begun: read into it, then call ``filled``.
+        So a large packet is copied once, out of the stream.
+        """
+        return None if self._body is None else self._body[self._filled :][:_LARGE_CHUNK]
+
+    def filled(self, size: int) -> Iterator[Packet]:
+        """Count bytes that were read into ``room``; yields the packet that they complete."""
+        self._filled += size
+        if self._body_is_complete():
+            yield self._take()
+
     def feed(self, data: Buffer) -> Iterator[Packet]:
         """Take the next bytes; yields the packets that they complete.
 

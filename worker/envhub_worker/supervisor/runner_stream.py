@@ -115,18 +115,21 @@ class RunnerLink:
         Raises ``RemoteProtocolError``: the runner sent an unexpected packet. Trust: the runner is
         hostile.
         """
+        room, data = self._reader.room, b""
         try:
-            data = self.sock.recv(self._reader.chunk)
+            if room is None:
+                data = self.sock.recv(self._reader.chunk)
+            size = len(data) if room is None else self.sock.recv_into(room)
         except BlockingIOError:
             return []
         except OSError:
             return None
-        if not data:
+        if not size:
             return None
-        self.received += len(data)
+        self.received += size
         answers = []
         try:
-            for packet in self._reader.feed(data):
+            for packet in self._reader.feed(data) if room is None else self._reader.filled(size):
                 answers.append((packet, self.pending.pop(packet.request_id)))
         except RemoteProtocolError:
             # Replies before the offence are dropped, too: their owners get the runner's death.
