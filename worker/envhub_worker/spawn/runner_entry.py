@@ -165,6 +165,9 @@ def _bring_in(folder: str, home: str) -> None:
     _make_environment(environment, folder)
     sys.executable = f"{environment}/bin/python"
     sys.prefix = sys.exec_prefix = environment
+    site.PREFIXES[:] = [environment]  # packages look there for their own files
+    site.ENABLE_USER_SITE = False
+    site.getusersitepackages()  # sets it, as at each start of Python
     os.environ["PATH"] = f"{environment}/bin:{folder}/bin:{os.environ['PATH']}"
     os.environ["VIRTUAL_ENV"] = environment
     site.setquit()

@@ -69,6 +69,12 @@ def test_packages_lie_behind_the_standard_library(cell: Cell) -> None:
     assert cell.run("import colorsys; result = hasattr(colorsys, 'mine')") == {"result": False}
     assert cell.run("import sys; result = sys.started") == {"result": True}
     assert cell.run("result = callable(exit)") == {"result": True}
+    asked = (
+        "import os, site; both = [site.getsitepackages()[0], site.USER_SITE]; "
+        "result = [os.path.exists(f'{both[0]}/mine.py'), *(path in both[1] for path in "
+        "(os.environ['HOME'], site.USER_BASE)), site.ENABLE_USER_SITE]"
+    )
+    assert cell.run(asked) == {"result": [True, True, True, False]}
 
 
 def test_packages_are_as_deep_as_paths_go(folder: Path, runtime: Runtime) -> None:
