@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.shared_memory.columns import StepColumns
 from envhub_worker.protocol.spaces import batches
-from tests.support import wire
+from tests.support import inside, wire
 from tests.support.compare import assert_same
 
 VALUES: dict[str, st.SearchStrategy[Any]] = {
@@ -84,3 +85,18 @@ def test_shards_join_as_one_batch(infos: list[dict[str, Any]], data: st.DataObje
                 results.infos(parts)
             return
         assert_same(expected, results.infos(parts))
+
+
+def test_columns_of_a_slice_are_recurring_forms() -> None:
+    """In a message that comes again, and in memory, they are read without the codec."""
+    row = {"a": 0.5, "inner": {"b": np.int8(3)}, "array": np.ones(2)}
+    columns = batches.flat_infos([(0, row), (1, row)], 2)
+    message = m.Value(columns)
+    frames = m.pack(message)
+    for _ in range(3):
+        assert_same(columns, m.unpack(frames).value)  # type: ignore[attr-defined]
+    assert any(bytes(frames[0]).startswith(document) for document in inside.forms())
+    memory, form = bytearray(4096), StepColumns([columns], 4096)
+    written = form.write([columns], memory, 0)
+    [read] = form.read(memory, 0, written, tensors=lambda array, name: array)
+    assert_same(columns, read)

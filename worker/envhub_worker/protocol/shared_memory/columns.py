@@ -24,6 +24,7 @@ from envhub_worker.protocol.codec.decoder import TensorMaker
 from envhub_worker.protocol.errors import UNTRUSTED, RemoteProtocolError
 from envhub_worker.protocol.messages.forms import IrregularError
 from envhub_worker.protocol.shared_memory.words import INFO_BYTES, LINE
+from envhub_worker.protocol.spaces.batches import APART_CLASSES
 
 _MAX_PARTS = 1024
 _PLAIN = frozenset({float, int, bool, str})
@@ -75,7 +76,7 @@ class StepColumns:
             return self._scalar(kind, kind, item=False)
         if value is None or kind is bytes:
             return partial(_take_same, value), lambda scalars, found: value
-        if kind is dict and not set(map(type, value)) - {str}:
+        if kind is dict and {str}.issuperset(map(type, value.keys() - {APART_CLASSES})):
             return self._members(kind, value.values(), list(value))
         # A named tuple crosses as its members, unless it says that it has others.
         named = issubclass(kind, tuple) and (kind.__iter__, kind.__len__) == _AS_TUPLES
