@@ -61,7 +61,7 @@ def _columns_of_all(parts: Sequence[Infos], sizes: Sequence[int]) -> Infos | Non
     classes = parts[0].get(batches.APART_CLASSES)
     if classes is None or any(part.get(batches.APART_CLASSES) != classes for part in parts):
         return None
-    _refuse_unless(_count(classes) * sum(sizes) <= _MOST_BYTES, "few enough")  # a mask for each
+    _refuse_unless_few(_count(classes) * sum(sizes), 1)  # each column gets a mask
     columns = [{key: part[key] for key in part if key != batches.APART_CLASSES} for part in parts]
     joined = _joined_columns(columns, sizes, classes)
     return None if joined is None else {batches.APART_CLASSES: classes, **joined}
@@ -101,7 +101,7 @@ def each_of(part: Infos, size: int) -> OwnInfos:
     own: OwnInfos = [[] for _ in range(size)]
     classes, forms = part.get(batches.APART_CLASSES, {}), part.get(batches.APART_FORMS, {})
     _refuse_unless(type(classes) is type(forms) is dict, "of a known form")
-    _refuse_unless(_count(classes) * size * _VALUE_BYTES <= _MOST_BYTES, "few enough")
+    _refuse_unless_few(_count(classes) * size)
     if classes:
         for some, row in zip(own, _rows(part, classes, size), strict=True):
             some.append((row, {}))
@@ -149,7 +149,7 @@ def _add_marks(own: OwnInfos, part: Infos, classes: Infos, size: int) -> None:
         _refuse_unless(is_mask or (type(key) is str and f"_{key}" in part), "one mapping each")
         if not is_mask and key not in classes:
             marked += size
-            _refuse_unless(marked * _VALUE_BYTES <= _MOST_BYTES, "few enough")
+            _refuse_unless_few(marked)
             mask = part[f"_{key}"]
             _refuse_unless_column(mask, size)
             _refuse_unless(mask.ndim == 1, "one value each")
@@ -159,6 +159,11 @@ def _add_marks(own: OwnInfos, part: Infos, classes: Infos, size: int) -> None:
         if mark:
             *others, (info, form) = own[index] or [({}, {})]
             own[index] = [*others, ({**info, **mark}, form)]
+
+
+def _refuse_unless_few(values: int, value_bytes: int = _VALUE_BYTES) -> None:
+    most = _MOST_BYTES // value_bytes
+    _refuse_unless(values <= most, f"at most {most} values, but {values}")
 
 
 def _refuse_unless(holds: bool, claim: str) -> None:
