@@ -113,6 +113,11 @@ _DISPLAY = (
 )
 _NO_LIBRARY = r"(unable|fail|can ?not|could not|no such|not found|not available)"
 _OSMESA = rf"(?i)osmesa[^\n]{{0,80}}{_NO_LIBRARY}|{_NO_LIBRARY}[^\n]{{0,80}}osmesa|glGetError"
+_VARIABLE = (
+    r"(?i:\b(declare|define|set|missing|need|requires?)\b[^\n]{0,40}\benvironment variable)\W{1,4}"
+    r"(?P<variable>[A-Z][A-Z0-9_]{1,60}_(HOME|PATH|DIR|ROOT))\b"
+)
+"""Of a folder: a stranger's text shall not have us advise to pass on a token."""
 _OFFLINE: dict[str, tuple[str, ...]] = {"network": ("none", "loopback")}
 _ADVICE: tuple[tuple[str, dict[str, tuple[str, ...]], str], ...] = (
     (
@@ -160,6 +165,12 @@ _ADVICE: tuple[tuple[str, dict[str, tuple[str, ...]], str], ...] = (
         "(render_mode='rgb_array'), or give the jail a display of its own, with {display}",
     ),
     (
+        _VARIABLE,
+        {},
+        "A jail has few variables of this process: set this one here, to a folder that the jail "
+        "can see, and pass it on with {variable}",
+    ),
+    (
         r"No such file or directory: ['\"](?=/)[^'\"\n]{0,4096}/packages/",
         {},
         "An installed package lacks this file as it was published: no argument brings it, but "
@@ -199,6 +210,7 @@ def add_reach_advice(error: EnvHubError, policy: Policy) -> bool:
 
 def _advice(text: str, policy: Policy, patterns: Collection[str] = ()) -> str:
     """The first advice that fits a text; ``patterns``: only consider rows with these patterns."""
+    named = re.search(_VARIABLE, text)
     for pattern, granted, sentence in _ADVICE:
         applies = all(getattr(policy, name) in values for name, values in granted.items())
         if applies and pattern in (patterns or (pattern,)) and re.search(pattern, text):
@@ -208,7 +220,7 @@ def _advice(text: str, policy: Policy, patterns: Collection[str] = ()) -> str:
                 egl=option_name("environment", ["MUJOCO_GL"]),
                 extra=option_name("dependencies", {"extra": _to_install(text)}),
                 loopback=option_name("network", "loopback"),
-                variable=option_name("environment", ["NAME"]),
+                variable=option_name("environment", [named["variable"] if named else "NAME"]),
             )
     return ""
 

@@ -205,6 +205,11 @@ def advised(kind: str, message: str, network: str = "none") -> str:
         ("ImportError", "pip install git+https://x/y", "{'extra': ['PACKAGE']}"),
         ("ImportError", "`pip install " + "a==1 " * 64, "{'extra': ['a==1']}"),  # not in 2**64 ways
         ("EOFError", "EOF when reading a line", "policy={'environment': ['NAME']}"),
+        (
+            "ImportError",
+            "Please declare the environment variable 'SIM_HOME'",
+            "policy={'environment': ['SIM_HOME']}",
+        ),
         ("ImportError", "('Unable to load OpenGL library', 'OSMesa: cannot open')", "libosmesa6"),
         ("AttributeError", "'NoneType' object has no attribute 'glGetError'", "libosmesa6"),
         ("OSError", "[Errno 97] Address family not supported by protocol", "'loopback'"),
@@ -263,6 +268,7 @@ def test_arguments_that_an_environment_lacks_are_named(
     [
         ("ValueError", "pip and git are words, a display too", "none"),
         ("KeyError", "'connect'", "none"),
+        ("KeyError", "please set the environment variable HF_TOKEN", "none"),
         ("FileNotFoundError", "[Errno 2] No such file or directory: 'ffmpeg'", "none"),
         ("socket.gaierror", "[Errno -3] Temporary failure in name resolution", "host"),
         ("ConnectionRefusedError", "[Errno 111] Connection refused", "loopback"),
