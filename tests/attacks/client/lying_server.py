@@ -167,17 +167,17 @@ def honest(request: m.Message) -> m.Message:
     if isinstance(request, (m.Reset, m.Step)):
         done = step_done()
         return done if isinstance(request, m.Step) else m.ResetDone(done.observation, {})
-    answers: dict[type[m.Message], m.Message] = {
-        m.Hello: m.Welcome(m.VERSION, "0", os.getpid()),
-        m.OpenJail: m.JailOpened(1, (1,), ()),
-        m.StartRunners: m.JailOpened(1, (2,), ()),
-        m.ShareSlabs: m.Refusal("WorkerError", "it takes no steps itself", "", ""),
-        m.CloseJail: m.Done(),
-        m.ReadOutput: m.Output(""),
-        m.GetStatus: m.Status(()),
-        m.Load: m.LoadDone(manifest()),
-        m.LoadTask: m.Value((NUM_ENVS, True)),
-        m.Build: m.BuildDone(encode_env(env_manifest())),
-        m.Call: m.Value((None,) * NUM_ENVS),
+    answers: dict[type[m.Message], Callable[[], m.Message]] = {
+        m.Hello: lambda: m.Welcome(m.VERSION, "0", os.getpid()),
+        m.OpenJail: lambda: m.JailOpened(1, (1,), ()),
+        m.StartRunners: lambda: m.JailOpened(1, (2,), ()),
+        m.ShareSlabs: lambda: m.Refusal("WorkerError", "it takes no steps itself", "", ""),
+        m.CloseJail: lambda: m.Done(),
+        m.ReadOutput: lambda: m.Output(""),
+        m.GetStatus: lambda: m.Status(()),
+        m.Load: lambda: m.LoadDone(manifest()),
+        m.LoadTask: lambda: m.Value((NUM_ENVS, True)),
+        m.Build: lambda: m.BuildDone(encode_env(env_manifest())),
+        m.Call: lambda: m.Value((None,) * NUM_ENVS),
     }
-    return answers.get(type(request), m.Value(None))
+    return answers.get(type(request), lambda: m.Value(None))()
