@@ -238,9 +238,9 @@ class InFlight:
         if not self._order.results.manifest.shardable:
             cure = "the repository's own vector class does so: wait for all of them, or use `step`"
         elif queue.part.repository.policy.restart == "transparent":
-            cure = 'with `restart="transparent"` give make_env `min_ready`, which separates them'
+            cure = 'with `restart="transparent"` give make_env `min_ready`, and no `num_workers=1`'
         else:
-            cure = "give make_env `min_ready`, or a larger `num_workers`, for more workers"
+            cure = "give make_env a larger `num_workers`, or `min_ready` and no `num_workers`"
         raise ValueError(f"`min_ready` is {min_ready}, but {whole}: {cure}. Nothing is lost")
 
     def _wait(self, deadline: Deadline) -> list[int]:
