@@ -184,9 +184,7 @@ def test_the_control_draws_memory() -> None:
     assert done.stdout.strip() == "True"
 
 
-@pytest.mark.parametrize(
-    "lie", [np.zeros(3), "1", 1.5, True, {"a": 1}, [1], (None, b"1")], ids=repr
-)
+@pytest.mark.parametrize("lie", [np.zeros(3), "1", 1.5, {"a": 1}, [1], (None, b"1")], ids=repr)
 def test_seeds_are_numbers(liar: LyingServer, folder: str, lie: Any) -> None:
     liar.lies[m.GetOwn] = relayed(m.Value(lie))
     with opened(liar, folder) as suites:
