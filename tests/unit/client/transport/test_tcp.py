@@ -122,7 +122,13 @@ def test_what_was_read_of_a_refusal_is_raised_next(monkeypatch: pytest.MonkeyPat
             hangs_up(listener)
         assert link.monitor.poll(60_000)
         link.read_ahead()
-        assert not link.monitor.poll(0)
-        with pytest.raises(SandboxUnavailableError, match="both"):
+        with (
+            zmq.Context() as context,
+            context.socket(zmq.PAIR) as silent,
+            monkeypatch.context() as patched,
+        ):
+            # what happens to the connection afterwards is no business of this test
+            patched.setattr(link, "monitor", silent)
+            with pytest.raises(SandboxUnavailableError, match="both"):
+                link.drain()
             link.drain()
-        link.drain()
