@@ -25,7 +25,12 @@ def printable(text: str, limit: int = 16_384) -> str:
         )
     if text.replace("\n", "").replace("\t", "").isprintable():  # as most tracebacks are
         return text
-    return "".join(char if char in _KEPT or char.isprintable() else _escaped(char) for char in text)
+    return "".join(
+        char
+        if char in _KEPT or char.isprintable()
+        else char.encode("unicode_escape", "backslashreplace").decode("ascii")
+        for char in text
+    )
 
 
 def counted(count: int, noun: str, plural: str = "") -> str:
@@ -107,10 +112,6 @@ def quoted(text: str) -> str:
     return MARGIN + continued(text)
 
 
-def _escaped(char: str) -> str:
-    return char.encode("unicode_escape", "backslashreplace").decode("ascii")
-
-
 _SPACE = "free space, or remove files if their number is used up (df -h; df -i)"
 _CURES = {
     errno.EMFILE: "raise the limit{} on open files (ulimit -n; of a service LimitNOFILE=)",
@@ -136,12 +137,9 @@ def shortage(error: BaseException, where: str) -> str:
         return ""
     name = getattr(error, "filename", None)
     file = f" ({name})" if name else ""
-    return f"{getattr(error, 'strerror', error)}{file} {where}: {cure.format(_file_limit())}"
+    limit = ""
+    if sys.platform != "win32":
+        import resource  # which Windows has not, and few need
 
-
-def _file_limit() -> str:
-    if sys.platform == "win32":
-        return ""
-    import resource  # which Windows has not, and few need
-
-    return f" of {resource.getrlimit(resource.RLIMIT_NOFILE)[0]:,}"
+        limit = f" of {resource.getrlimit(resource.RLIMIT_NOFILE)[0]:,}"
+    return f"{getattr(error, 'strerror', error)}{file} {where}: {cure.format(limit)}"

@@ -241,15 +241,9 @@ def native(array: Array) -> Array:
     """Returns the array in native byte order, its text free of lone surrogates."""
     if not array.dtype.isnative:
         array = array.astype(array.dtype.newbyteorder("="))
-    if array.dtype.kind in "US":
-        return _plain_text(array)
-    return array
-
-
-def _plain_text(array: Array) -> Array:
-    if not array.dtype.itemsize:
+    if array.dtype.kind in "US" and not array.dtype.itemsize:
         return array.astype(f"{array.dtype.kind}1")
-    if array.dtype.kind == "S" or not array.size:
+    if array.dtype.kind != "U" or not array.size:
         return array
     points = np.ascontiguousarray(array.reshape(-1)).view(np.uint32)
     lone = (points >= 0xD800) & (points <= 0xDFFF)
@@ -354,13 +348,6 @@ def _write_text_scalar(encoder: Encoder, value: np.str_ | np.bytes_) -> object:
 _TENSOR_HEADS = {name: msgpack.ExtType(wire.TENSOR, name.encode()) for name in wire.TENSOR_DTYPES}
 
 
-def _write_tensor(encoder: Encoder, tensor: Any) -> object:
-    name, array = tensor_bits(tensor)
-    if array is None:
-        return encoder.unknown(tensor)
-    return [_TENSOR_HEADS[name], encoder.array(array)]
-
-
 def tensor_bits(tensor: Any) -> tuple[str, Array | None]:
     """Torch's name of a tensor's dtype, and an array of its bits; None if the wire has no form."""
     name, strided = _tensor_form(tensor.dtype, tensor.layout)
@@ -385,7 +372,10 @@ def write_numpy(encoder: Encoder, value: Any) -> object:
     """The wire's form of an array subclass or another library's array, else NotImplemented."""
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(value, getattr(torch, "Tensor", ())):
-        return _write_tensor(encoder, value)
+        name, bits = tensor_bits(value)
+        return (
+            encoder.unknown(value) if bits is None else [_TENSOR_HEADS[name], encoder.array(bits)]
+        )
     if isinstance(value, (np.str_, np.bytes_)):
         return _write_text_scalar(encoder, value)
     if isinstance(value, np.generic):

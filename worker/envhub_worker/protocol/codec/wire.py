@@ -117,16 +117,12 @@ def check_document(document: bytes, limits: WireLimits) -> None:
         MessageTooLargeError: The document exceeds ``limits`` of depth, length or items.
         RemoteProtocolError: It is not msgpack, or contains a type that this protocol does not use.
     """
-    if not _looks_flat(document, limits):
-        _walk(document, limits)
-
-
-def _looks_flat(document: bytes, limits: WireLimits) -> bool:
-    """A cheap check that a document is within all limits; it may reject one that is."""
-    if len(document) > min(_SMALL_BYTES, limits.items, limits.text_bytes):
-        return False
-    openers = len(document) - len(document.translate(None, _OPENERS))
-    return openers <= limits.depth and not (0xFF in document and _TIMESTAMP.search(document))
+    # First a cheap check, which most documents within all limits pass.
+    if len(document) <= min(_SMALL_BYTES, limits.items, limits.text_bytes):
+        openers = len(document) - len(document.translate(None, _OPENERS))
+        if openers <= limits.depth and not (0xFF in document and _TIMESTAMP.search(document)):
+            return
+    _walk(document, limits)
 
 
 def _walk(document: bytes, limits: WireLimits) -> None:

@@ -121,10 +121,8 @@ def encode_env(manifest: EnvManifest, *, seeded: bool = False) -> dict[str, obje
 def encode_manifest(manifest: Manifest) -> dict[str, object]:
     """Encodes a manifest as a plain value, with the generators of seeded spaces."""
     return {
+        **vars(manifest),
         "envs": tuple(encode_env(env, seeded=True) for env in manifest.envs),
-        "lazy": manifest.lazy,
-        "interpreter": manifest.interpreter,
-        "packages": manifest.packages,
     }
 
 

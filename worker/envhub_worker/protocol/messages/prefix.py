@@ -80,19 +80,16 @@ class Prefix(Generic[T]):
         if len(frames) < 2 or memoryview(frames[0]).cast("B")[_LENGTH_BYTES:end] != self._head:
             return [], frames
         with UNTRUSTED:
-            return list(map(self._check, self._things(frames[0]))), frames[1:]
-
-    def _things(self, frame: Buffer) -> tuple[object, ...]:
-        """Decodes the items of a frame after a check of its size."""
-        size, name = memoryview(frame).nbytes, self._kind.__name__
-        if size > self._max_bytes:
-            text = f"{size} bytes of {name} are over the limit of {self._max_bytes}."
-            raise MessageTooLargeError(text)
-        message = unpack([frame])
-        things = values_of(message)[0] if type(message) is self._kind else None
-        if type(things) is not tuple or len(things) > self.most:
-            raise RemoteProtocolError(f"the worker sent {name} in another form than was agreed on")
-        return things
+            size, name = memoryview(frames[0]).nbytes, self._kind.__name__
+            if size > self._max_bytes:
+                text = f"{size} bytes of {name} are over the limit of {self._max_bytes}."
+                raise MessageTooLargeError(text)
+            message = unpack(frames[:1])
+            items = values_of(message)[0] if type(message) is self._kind else None
+            if type(items) is not tuple or len(items) > self.most:
+                text = f"the worker sent {name} in another form than was agreed on"
+                raise RemoteProtocolError(text)
+            return list(map(self._check, items)), frames[1:]
 
 
 def _warning(value: object) -> RemoteWarning:

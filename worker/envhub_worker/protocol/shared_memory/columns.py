@@ -165,8 +165,10 @@ class StepColumns:
         if slot is None:
             found = [copy() for copy in copies]
         else:
-            pairs = zip(copies, self._arrays, strict=True)
-            found = [_borrowed(slot, *one) if _large(*one) else copy() for copy, one in pairs]
+            found = [
+                np.ndarray(shape, dtype, slot, at) if _large(shape, dtype) else copy()
+                for copy, (shape, dtype, at, _) in zip(copies, self._arrays, strict=True)
+            ]
         for index, name in self._tensors:
             found[index] = tensors(found[index], name)
         scalars: Iterator[Any] = iter(())
@@ -231,9 +233,5 @@ def _copier(memory: Any, start: int, shape: Any, dtype: Any, at: int, _: str) ->
     return array.copy
 
 
-def _large(shape: Any, dtype: Any, *_: Any) -> bool:
+def _large(shape: Any, dtype: Any) -> bool:
     return bool(dtype.kind != "b" and dtype.itemsize * math.prod(shape) > arrays.INLINE_BYTES)
-
-
-def _borrowed(slot: Any, shape: Any, dtype: Any, at: int, _: str) -> Any:
-    return np.ndarray(shape, dtype, slot, at)
