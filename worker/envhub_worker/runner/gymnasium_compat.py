@@ -43,14 +43,11 @@ OWN_NAMES = frozenset(
 _EXPERIMENTAL = "gymnasium.experimental.vector"
 
 
-def _add_what_came_with_0_29(env: Any, spaces: Any) -> None:
-    env.get_wrapper_attr = lambda self, name: getattr(self, name)
-    spaces.MultiDiscrete.start = property(lambda space: np.zeros_like(space.nvec))
-    spaces.Sequence.stack = False
-
-
 if not hasattr(gym.Env, "get_wrapper_attr"):
-    _add_what_came_with_0_29(gym.Env, gym.spaces)
+    _old_gymnasium: Any = gym
+    _old_gymnasium.Env.get_wrapper_attr = lambda self, name: getattr(self, name)
+    _old_gymnasium.spaces.MultiDiscrete.start = property(lambda space: np.zeros_like(space.nvec))
+    _old_gymnasium.spaces.Sequence.stack = False
 
 
 def mode_named(mode: Any) -> str:

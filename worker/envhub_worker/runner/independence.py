@@ -34,10 +34,11 @@ import threading
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from math import inf
 from time import monotonic, process_time
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -112,16 +113,13 @@ def are_independent(task: Task, root: str, budget: Budget) -> bool:
     if together is None:
         return False
     steps = int.from_bytes(together[:_STEP_BYTES], "little")
-    digests = [together[at:][:_DIGEST_BYTES] for at in _offsets(count)]
+    starts = range(_STEP_BYTES, len(together), _DIGEST_BYTES)
+    digests = [together[start:][:_DIGEST_BYTES] for start in starts]
     for index in sorted({*range(count)[:_ALONE], *range(count)[-_ALONE:]}):
         alone = in_fork(partial(_play, task, [index], steps, root), 1, budget)
         if alone is None or alone[_STEP_BYTES:] != digests[index]:
             return False
     return True
-
-
-def _offsets(count: int) -> Iterable[int]:
-    return range(_STEP_BYTES, _STEP_BYTES + count * _DIGEST_BYTES, _DIGEST_BYTES)
 
 
 def in_fork(play: Callable[[], bytes], count: int, budget: Budget) -> bytes | None:
@@ -157,22 +155,18 @@ def in_fork(play: Callable[[], bytes], count: int, budget: Budget) -> bytes | No
 def _play_and_exit(play: Callable[[], bytes], sink: int, most_bytes: int) -> None:
     try:
         os.setpgid(0, 0)
-        _bound_memory(most_bytes)
+        # It may take this many more bytes of memory than it shares with this process.
+        with open("/proc/self/statm") as file:
+            data_pages = int(file.read().split()[5])
+        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        most = data_pages * resource.getpagesize() + most_bytes
+        resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
         os.write(sink, play())
     finally:
         os._exit(0)
-
-
-def _bound_memory(most_bytes: int) -> None:
-    """Let this process take at most this many more bytes of memory."""
-    with open("/proc/self/statm") as file:
-        data_pages = int(file.read().split()[5])
-    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    most = data_pages * resource.getpagesize() + most_bytes
-    resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
 
 
 def _read(source: int, size: int, left_s: Callable[[], float]) -> bytes | None:
@@ -208,7 +202,13 @@ def _play(task: Task, indices: Sequence[int], steps: int | None, root: str) -> b
     turns.most_s = _BUILD_S if steps is None else inf
     build = [partial(turns.run, index, partial(task.build_one, index)) for index in indices]
     envs = SubEnvs(build, task.recording.autoreset_mode, sync=False, sliced=True)
-    envs.driven = [_Turn(turns, index, env) for index, env in zip(indices, envs.envs, strict=True)]
+    # Each sub-environment is reset and stepped in its turn.
+    envs.driven = [
+        SimpleNamespace(
+            reset=partial(turns.run, index, env.reset), step=partial(turns.run, index, env.step)
+        )
+        for index, env in zip(indices, envs.envs, strict=True)
+    ]
     state.built(envs.envs)
     play = _Play(envs, indices)
     play.reset([_SEED + index for index in indices])
@@ -292,14 +292,6 @@ def _add(digest: hashlib.blake2b, value: object) -> None:
     digest.update(_ADDRESS.sub(b"0x", bytes(frames[0])))
     for frame in frames[1:]:
         digest.update(frame)
-
-
-class _Turn:
-    """Wraps one sub-environment: runs its ``reset`` and ``step`` in its turn."""
-
-    def __init__(self, turns: Turns, index: int, env: Any) -> None:
-        self.reset = partial(turns.run, index, env.reset)
-        self.step = partial(turns.run, index, env.step)
 
 
 _OURS = -1

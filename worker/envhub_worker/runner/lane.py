@@ -251,14 +251,11 @@ class Lane:
     def _change(self) -> None:
         self._spin_ns = self._asked[slabs.SPIN]
         if self._asked[slabs.CPU] != self._cpu:
-            self._keep_to(self._asked[slabs.CPU])
-
-    def _keep_to(self, cpu: int) -> None:
-        self._cpu = cpu
-        avoided, core = divmod(cpu, slabs.AVOIDED)
-        others = own_cores() - {core - 1}
-        with contextlib.suppress(OSError):  # it may have gone, or not be ours
-            os.sched_setaffinity(0, {core - 1} if core and not avoided else others)
+            self._cpu = self._asked[slabs.CPU]
+            avoided, core = divmod(self._cpu, slabs.AVOIDED)
+            others = own_cores() - {core - 1}
+            with contextlib.suppress(OSError):  # it may have gone, or not be ours
+                os.sched_setaffinity(0, {core - 1} if core and not avoided else others)
 
     def infos(self) -> dict[Any, Any]:
         """Returns the last step's infos, which did not fit into the slab."""
@@ -349,15 +346,11 @@ class ColumnLane(Lane):
         self._env.batch.choose(request[slabs.SLOT], carry=bool(request[slabs.MESSAGE]))
         codes = request[slabs.DTYPES : slabs.DTYPES + len(self._layout.actions)].tolist()
         if codes != self._codes:
-            self._codes = codes
-            pairs = zip(self._layout.actions, codes, strict=True)
-            self._takes = [self._taker(leaf, code) for leaf, code in pairs]
-
-    def _taker(self, leaf: slabs.Leaf, code: int) -> Callable[[], Any]:
-        """Returns a function that reads one leaf of the actions in the caller's dtype."""
-        listed, code = divmod(code, slabs.LISTED)
-        view = slabs.view(self._request, leaf, slabs.ACTION_DTYPES[code])
-        return view.tolist if listed else view.copy
+            self._codes, self._takes = codes, []
+            for leaf, code in zip(self._layout.actions, codes, strict=True):
+                listed, code = divmod(code, slabs.LISTED)  # the caller's dtype, or Python's numbers
+                view = slabs.view(self._request, leaf, slabs.ACTION_DTYPES[code])
+                self._takes.append(view.tolist if listed else view.copy)
 
     def infos(self) -> dict[Any, Any]:
         """Returns the last step's infos: see ``Lane``."""
@@ -459,10 +452,7 @@ class InfoWriter:
             or not all(map(batches.is_scalar, types))
         ):
             return
-        by_key = {column.key: column for column in columns}
-        self._rows = [self._view(by_key[key]) for key in first]
-        self._masks = [self._view(by_key[f"_{key}"]) for key in first]
+        views = {column.key: column.view(self._reply, self._start) for column in columns}
+        self._rows = [views[key] for key in first]
+        self._masks = [views[f"_{key}"] for key in first]
         self._keys, self._types, self._fresh = list(first), types, True
-
-    def _view(self, column: slabs.Column) -> Any:
-        return column.view(self._reply, self._start)

@@ -111,14 +111,11 @@ def _metadata(env: Any) -> dict[str, Any]:
 
 def _interpreter() -> dict[str, str]:
     version = f"{platform.python_implementation()} {platform.python_version()}"
-    return {"version": version, "executable": sys.executable or "", "platform": _platform()}
-
-
-def _platform() -> str:
-    """Returns the text of ``platform.platform()`` without the process that this would start."""
+    # as platform.platform(), without the process that this would start
     host = os.uname()
     libc = (os.confstr("CS_GNU_LIBC_VERSION") or "").replace(" ", "")
-    return "-".join(filter(None, (host.sysname, host.release, host.machine, libc)))
+    system = "-".join(filter(None, (host.sysname, host.release, host.machine, libc)))
+    return {"version": version, "executable": sys.executable or "", "platform": system}
 
 
 def _packages() -> dict[str, str]:

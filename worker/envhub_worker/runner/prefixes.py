@@ -215,7 +215,10 @@ def _is_plain(env: Any, name: str) -> bool | None:
     """
     while True:
         kind: Any = type(env)
-        if kind.get_wrapper_attr not in _SEARCHES or _intercepts(kind):
+        if kind.get_wrapper_attr not in _SEARCHES:
+            return False
+        intercepts = any("__getattr__" in vars(base) for base in kind.__mro__)
+        if intercepts or kind.__getattribute__ is not object.__getattribute__:
             return False
         values = [vars(base)[name] for base in kind.__mro__ if name in vars(base)]
         if values:  # of the class: a property, a method, or a value
@@ -226,9 +229,3 @@ def _is_plain(env: Any, name: str) -> bool | None:
         if not isinstance(env, gym.Wrapper):
             return None
         env = own["env"]
-
-
-def _intercepts(kind: Any) -> bool:
-    """Whether a class overrides attribute access."""
-    own = kind.__getattribute__ is not object.__getattribute__
-    return own or any("__getattr__" in vars(base) for base in kind.__mro__)

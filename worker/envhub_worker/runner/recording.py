@@ -98,7 +98,9 @@ def _record(
         return None
     if arguments.get("observation_mode", "same") != "same":
         return None  # the spaces differ, and only all of them make the batched one
-    if not _steps_all_at_once(arguments) or not _can_start(arguments):
+    # ``context`` names a start method of processes, and has no other use here.
+    methods = (None, *multiprocessing.get_all_start_methods())
+    if not _steps_all_at_once(arguments) or arguments.get("context") not in methods:
         return None
     env_fns = arguments["env_fns"] = list(arguments["env_fns"])
     return Recording(
@@ -116,12 +118,6 @@ def _steps_all_at_once(arguments: dict[str, Any]) -> bool:
         return True
     is_number = isinstance(bound, (int, np.integer))
     return is_number and bool(bound >= max(1, len(arguments["env_fns"])))
-
-
-def _can_start(arguments: dict[str, Any]) -> bool:
-    """Whether ``context`` names a start method of processes. It has no other use here."""
-    context = arguments.get("context")
-    return context is None or context in multiprocessing.get_all_start_methods()
 
 
 def _build_after_all(env: Any, cls: type) -> None:

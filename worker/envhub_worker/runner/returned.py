@@ -142,8 +142,9 @@ def raised_at(
         for layer in _layers(env):
             code = _code(type(layer), method, part)
             if code is not None:
-                known_result = result if layer is env else _passed_on(result)
-                return _with_line(error, code, _line_of_return(code, known_result))
+                if layer is not env:  # Gymnasium's wrappers may change all parts but terminated
+                    result = [value if at == 2 else ... for at, value in enumerate(result)]
+                return _with_line(error, code, _line_of_return(code, result))
     return error
 
 
@@ -153,11 +154,6 @@ def _layers(env: Any) -> Iterator[Any]:
             return
         yield env
         env = getattr(env, "env", None)
-
-
-def _passed_on(result: Sequence[Any]) -> Sequence[Any]:
-    """Drops every part of a result that Gymnasium's wrappers may change: keeps ``terminated``."""
-    return [value if at == 2 else ... for at, value in enumerate(result)]
 
 
 def _code(cls: type, method: str, part: str) -> CodeType | None:

@@ -197,7 +197,10 @@ class Runner:
 
     def _load(self, request: m.Load | m.LoadTask) -> list[Task]:
         self._stage = "import"
-        make_env = loader.import_entry(self._snapshot, self._entry, _scratch())
+        # A folder of the jail's own: its home, unless the caller's HOME names another.
+        home = os.environ.get("HOME", "")
+        scratch = home if os.access(home, os.W_OK | os.X_OK) else os.getcwd()
+        make_env = loader.import_entry(self._snapshot, self._entry, scratch)
         self._stage = "make_env"
         # Gymnasium's vector classes are stood in for: nothing is built before it is used.
         with standing_in():
@@ -420,12 +423,6 @@ def _step_done(env: SubEnvs, pairs: Pairs) -> m.Message:
     batch, infos = env.batch, env.joined(pairs)
     flags = (batch.rewards, batch.terminations, batch.truncations)
     return m.StepDone(batch.observation(), *flags, infos)
-
-
-def _scratch() -> str:
-    """Returns a folder of the jail's own: its home, unless the caller's HOME names another."""
-    home = os.environ.get("HOME", "")
-    return home if os.access(home, os.W_OK | os.X_OK) else os.getcwd()
 
 
 def _caller(env: Any) -> Callable[..., Any]:

@@ -121,15 +121,12 @@ class Batch:
 
     def write_to(self, slots: list[list[Any]]) -> None:
         """Write observations into these leaves from now on, one list of leaves per slot."""
-        self._slots = [
-            (leaves, _writer(self._space, iter(leaves)), self._rows_of(leaves)) for leaves in slots
-        ]
+        is_array = isinstance(self._space, ARRAY_SPACES)
+        self._slots = []
+        for leaves in slots:
+            rows = [leaves[0][index, ...] if is_array else None for index in range(self._count)]
+            self._slots.append((leaves, _writer(self._space, iter(leaves)), rows))
         self.choose(0)
-
-    def _rows_of(self, leaves: list[Any]) -> list[Any]:
-        if not isinstance(self._space, ARRAY_SPACES):
-            return [None] * self._count
-        return [leaves[0][index, ...] for index in range(self._count)]
 
     def choose(self, slot: int, *, carry: bool = False) -> None:
         """Write the next observations into another slot; ``carry`` copies the last ones there."""

@@ -68,7 +68,9 @@ class Task:
         """Builds a vector environment of the sub-environments ``start`` to ``stop``."""
         if self.recording is None:
             return self.vector
-        envs = [self._first_or_new(index) for index in range(start, stop)]
+        built = [self.probe] if start == 0 and self.probe is not None else []
+        self.probe = None if built else self.probe
+        envs = [*built, *map(self.build_one, range(start + len(built), stop))]
         self._refuse_differing(envs, start)
         env_fns: list[EnvFn] = [partial(_itself, env) for env in envs]
         sliced = stop - start < len(self.recording.env_fns)
@@ -106,12 +108,6 @@ class Task:
                     "one sub-environment; it has none from which it could be derived"
                 ) from None
         return self.spaces
-
-    def _first_or_new(self, index: int) -> Any:
-        if index or self.probe is None:
-            return self.build_one(index)
-        first, self.probe = self.probe, None
-        return first
 
     def build_one(self, index: int) -> Any:
         """Builds a sub-environment, adapted to Gymnasium's interface."""

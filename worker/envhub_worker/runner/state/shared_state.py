@@ -54,7 +54,7 @@ class SharedState:
     def __init__(self, root: str, report: Callable[[str], None]) -> None:
         self._root = os.path.join(root, "")
         self._report: Callable[[str], None] | None = report  # None once it was called
-        self._generators = _numpy_generator(), random._inst
+        self._generators = np.random.mtrand._rand._bit_generator, random._inst
         self._numpy, self._random = _numpy_words(self._generators[0]), _random_words()
         self._numpy_before, self._random_before = self._numpy.tolist(), self._random.tolist()
         self._torch = _torch_states()
@@ -87,7 +87,8 @@ class SharedState:
             return
         before, self._slow = self._slow, self._read()  # with modules that were imported since
         torch, self._torch = self._torch, _torch_states()  # it may have been imported since
-        if not _are_equal(torch, self._torch):
+        # Only what both readings have: a library imported since the first one counts as equal.
+        if any(state != now for state, now in zip(torch, self._torch)):  # noqa: B905
             self._say("torch")
             return
         for key, value in before.items():
@@ -141,10 +142,6 @@ _READABLE: dict[type, Callable[[Any], object]] = {
 }
 
 
-def _numpy_generator() -> Any:
-    return np.random.mtrand._rand._bit_generator
-
-
 def _numpy_words(generator: Any) -> memoryview:
     """Returns a live view of two words of ``numpy.random``: the state's first, and the position."""
     if type(generator) is not np.random.MT19937:
@@ -178,11 +175,6 @@ def _torch_states() -> list[Any]:
     if torch.cuda.is_initialized():
         generators += torch.cuda.default_generators
     return [generator.get_state().cpu().numpy().tobytes() for generator in generators]
-
-
-def _are_equal(before: list[Any], now: list[Any]) -> bool:
-    """Whether two readings are equal; a library imported since the first one counts as equal."""
-    return all(earlier == other for earlier, other in zip(before, now))  # noqa: B905
 
 
 def _working_directory() -> str:
