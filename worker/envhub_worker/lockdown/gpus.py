@@ -67,8 +67,10 @@ def granted(gpu: bool | tuple[int, ...], host: HostFiles) -> GpuGrant:
 
 def gpus(host: HostFiles) -> list[tuple[str, ...]]:
     """The nodes of each GPU: NVIDIA's first, in the order of ``nvidia-smi``, by PCI address."""
+    nvidias = [f"/dev/{name}" for name in host.listdir("/dev") if _NVIDIA.fullmatch(name)]
+    renders = [name for name in host.listdir("/dev/dri") if _RENDER.fullmatch(name)]
     by_device: dict[str, list[str]] = {}
-    for node in _own_nodes(host):
+    for node in (*sorted(nvidias), *sorted(f"/dev/dri/{name}" for name in renders)):
         by_device.setdefault(_address(node, host) or node, []).append(node)
 
     def place(device: str) -> tuple[bool, bool, list[str | int]]:
@@ -77,12 +79,6 @@ def gpus(host: HostFiles) -> list[tuple[str, ...]]:
         return not is_nvidias, device.startswith("/"), [device] if ":" in device else number
 
     return [tuple(by_device[device]) for device in sorted(by_device, key=place)]
-
-
-def _own_nodes(host: HostFiles) -> list[str]:
-    nvidias = [f"/dev/{name}" for name in host.listdir("/dev") if _NVIDIA.fullmatch(name)]
-    renders = [name for name in host.listdir("/dev/dri") if _RENDER.fullmatch(name)]
-    return sorted(nvidias) + sorted(f"/dev/dri/{name}" for name in renders)
 
 
 def _is_nvidias(node: str) -> bool:

@@ -113,7 +113,9 @@ class MemoryWatch:
         usage, hidden = Usage(), []
         for pid in pids:
             try:
-                _add_process(usage, pid)
+                fields = procfs.numbers(f"/proc/{pid}/status")
+                usage.private += fields.get(b"RssAnon", 0) + fields.get(b"VmSwap", 0)
+                usage.kernel += fields.get(b"VmPTE", 0)
                 _add_mappings(usage, pid)
                 _add_descriptors(usage, pid)
             except PermissionError:
@@ -133,12 +135,6 @@ class MemoryWatch:
         status = os.statvfs(self._tmpfs)
         entries = (status.f_files - status.f_ffree) * _ENTRY
         return (status.f_blocks - status.f_bfree) * status.f_frsize + entries
-
-
-def _add_process(usage: Usage, pid: int) -> None:
-    fields = procfs.numbers(f"/proc/{pid}/status")
-    usage.private += fields.get(b"RssAnon", 0) + fields.get(b"VmSwap", 0)
-    usage.kernel += fields.get(b"VmPTE", 0)
 
 
 def _add_mappings(usage: Usage, pid: int) -> None:

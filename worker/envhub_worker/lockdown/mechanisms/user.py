@@ -60,25 +60,17 @@ def _mapped() -> tuple[int, int]:
 
 
 def _unused(candidates: range) -> int:
-    running = _running_uids()
-    while True:
-        uid = random.SystemRandom().choice(candidates)
-        if uid not in running and not _has_name(uid):
-            return uid
-
-
-def _running_uids() -> set[int]:
-    uids = set()
+    running = set()
     for pid in procfs.pids():
         with contextlib.suppress(OSError):
-            uids.add(os.stat(f"/proc/{pid}").st_uid)
-    return uids
-
-
-def _has_name(uid: int) -> bool:
-    with contextlib.suppress(KeyError):
-        return bool(pwd.getpwuid(uid))
-    return False
+            running.add(os.stat(f"/proc/{pid}").st_uid)
+    while True:
+        uid = random.SystemRandom().choice(candidates)
+        try:
+            pwd.getpwuid(uid)
+        except KeyError:  # nobody's
+            if uid not in running:
+                return uid
 
 
 def become(uid: int) -> None:
