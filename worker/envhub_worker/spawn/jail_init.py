@@ -285,7 +285,11 @@ class Init:
         for pid, status in ended:
             runner = self._runners.pop(pid, None)
             if runner is not None:
-                self._report_exit(runner, status)
+                fields = {"runner": runner.number, **process.exit_fields(status)}
+                # What init has decided comes first: the kernel's own kills look the same from here.
+                reason, detail = runner.ended or self._reason(fields["signal"])
+                event = {"event": "runner_exited", "reason": reason, "detail": detail, **fields}
+                self._channel.send(event)
                 self._end_orphans(pid)
         if ended and not self._runners:
             reap.kill_descendants()  # daemons do not outlive the last runner
@@ -298,12 +302,6 @@ class Init:
             with contextlib.suppress(ProcessLookupError):
                 if os.getsid(pid) == session:
                     os.kill(pid, signal.SIGKILL)
-
-    def _report_exit(self, runner: _Runner, status: int) -> None:
-        fields = {"runner": runner.number, **process.exit_fields(status)}
-        # What init has decided comes first: the kernel's own kills look the same from here.
-        reason, detail = runner.ended or self._reason(fields["signal"])
-        self._channel.send({"event": "runner_exited", "reason": reason, "detail": detail, **fields})
 
     def _reason(self, signum: int | None) -> tuple[Reason, str]:
         if signum is None:

@@ -52,8 +52,12 @@ def run(jail: JailContext, fds: list[int], status: int, runners: int) -> NoRetur
     except BaseException:
         traceback.print_exc()
     finally:
+        for stream in (sys.stdout, sys.stderr):
+            try:
+                stream.flush()
+            except BaseException:
+                continue  # the stranger may have replaced or closed it
         # Not sys.exit, which would run the zygote's atexit handlers and unwind init's frames.
-        _flush()
         os._exit(code & 0xFF)
 
 
@@ -144,14 +148,6 @@ def _exit_code(error: SystemExit) -> int:
         return error.code or 0
     sys.stderr.write(f"{error.code}\n")
     return 1
-
-
-def _flush() -> None:
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            stream.flush()
-        except BaseException:
-            continue  # the stranger may have replaced or closed it
 
 
 def _bring_in(folder: str, home: str) -> None:
