@@ -41,7 +41,9 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         return _serve_in(arguments)
     except BaseException as error:
-        if _client_has_gone(arguments):  # a client that runs reads our log, then removes the folder
+        # A client that runs reads our log, then removes the folder; one that has gone does neither.
+        client = 0 if arguments.until_eof else arguments.client_pidfd
+        if client is not None and select.select([client], [], [], 0)[0]:
             from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 
             remove_tree(str(arguments.runtime_dir))
@@ -50,11 +52,6 @@ def run(arguments: argparse.Namespace) -> int:
         if short := shortage(error, "here"):
             sys.exit(short)
         raise
-
-
-def _client_has_gone(arguments: argparse.Namespace) -> bool:
-    fd = 0 if arguments.until_eof else arguments.client_pidfd
-    return fd is not None and bool(select.select([fd], [], [], 0)[0])
 
 
 def _serve_in(arguments: argparse.Namespace) -> int:

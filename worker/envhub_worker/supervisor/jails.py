@@ -138,13 +138,16 @@ class Jails:
         zygote = (request.runtime, started_with, *of_policy)
         self._check_zygotes(asker, zygote)
         jail = self._spawner(zygote, request.runtime, confinement).spawn(spec)
+        # Kept in the server's memory: as with the wire's limits, no stranger chooses how much.
+        most = confinement.limits.output_bytes
+        output_bytes = most if self._local else min(most, MAX_SERVED_OUTPUT)
         entry = JailRecord(
             number=secrets.randbits(62),
             name=request.name,
             session=asker.session,
             jail=jail,
             zygote=zygote,
-            output=OutputTail(jail.output, self._output_bytes(confinement)),
+            output=OutputTail(jail.output, output_bytes),
         )
         self._jails[entry.number] = entry
         self._events.follow(entry)
@@ -181,11 +184,6 @@ class Jails:
         """Returns the client's wire limits; for a client on another host at most our own."""
         most = entry.jail.spec.confinement.limits.message_bytes
         return limits_for(most if self._local else min(most, DEFAULT_LIMITS.message_bytes))
-
-    def _output_bytes(self, confinement: Confinement) -> int:
-        """Returns the bytes of output to keep in the server's memory, limited like the wire's."""
-        most = confinement.limits.output_bytes
-        return most if self._local else min(most, MAX_SERVED_OUTPUT)
 
     def _start_runners(self, asker: Asker, entry: JailRecord, count: int) -> None:
         runners = []
