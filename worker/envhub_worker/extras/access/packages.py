@@ -305,10 +305,8 @@ class Packages:
         """Returns waiting orders in turn: first that of the key that has waited longest."""
         orders = self._orders.items()
         waiting = [name for name, order in orders if order.program is None and order.result is None]
-        return sorted(waiting, key=self._last_begun)
-
-    def _last_begun(self, order_id: OrderId) -> float:
-        return max(self._begun[order_id[0]], default=0.0)
+        begun = {name: max(self._begun[name[0]], default=0.0) for name in waiting}
+        return sorted(waiting, key=begun.__getitem__)
 
     def _why_waiting(self, order_id: OrderId) -> str:
         """Returns the progress of a waiting order, with no more than the number of the others."""

@@ -209,9 +209,6 @@ class RemoteGate(Gate):
             self.sessions.keep(session, request.jails[:4096])
         return m.Done()
 
-    def _list_sessions(self, asker: Asker, request: m.GetSessions, payload: Payload) -> m.Message:
-        return m.Sessions(tuple(self._sessions_of(asker.key)), self.figures(asker.key))
-
     def answered(self, asker: Asker, reply: m.Message) -> None:
         """Stop counting a request's bytes as in flight; count and log a refusal."""
         self._in_flight.answered(asker)
@@ -251,11 +248,11 @@ class RemoteGate(Gate):
             "clients": clients.plain(),
         }
 
-    def _sessions_of(self, key: bytes) -> list[dict[str, Any]]:
+    def _list_sessions(self, asker: Asker, request: m.GetSessions, payload: Payload) -> m.Message:
         self._places.end_deserted()
-        all_of_them = key in self._rules.operators
-        sessions = self.sessions.all() if all_of_them else self.sessions.of_key(key)
-        return [
+        all_of_them = asker.key in self._rules.operators
+        sessions = self.sessions.all() if all_of_them else self.sessions.of_key(asker.key)
+        listed = tuple(
             {
                 "client": self._name_of(session.key) or "operator",
                 "key": key_text(session.key),
@@ -267,7 +264,8 @@ class RemoteGate(Gate):
             }
             for session in sessions
             if session.name != WATCHER  # the one that asks, above all
-        ]
+        )
+        return m.Sessions(listed, self.figures(asker.key))
 
     # --- time ----------------------------------------------------------------------------------
 

@@ -249,13 +249,9 @@ class Events(Witness):
     def _client(self, owner: bytes, event: str, level: str, **more: object) -> None:
         key = owner[:KEY_BYTES]
         nameless = f"key {key_text(key)[:16]}" if any(key) else "anybody"
-        who = {"client": self._name_of(key) or nameless, "session": session_id(owner)}
+        session = owner[KEY_BYTES:].hex()[:8]  # as in ``envhub-worker status``: the client's choice
+        who = {"client": self._name_of(key) or nameless, "session": session}
         self._log.say(event, level, whose=key_text(key), **who, **more)
-
-
-def session_id(owner: bytes) -> str:
-    """Returns a session's id as in ``envhub-worker status``; the client has chosen it."""
-    return owner[KEY_BYTES:].hex()[:8]
 
 
 def _jail(entry: JailRecord) -> dict[str, object]:

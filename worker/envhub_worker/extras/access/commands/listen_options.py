@@ -134,10 +134,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     # for a program that starts its own server: see the docstring of __main__.py
     for name in ("--client-pidfd", "--ready-fd"):
         parser.add_argument(name, type=int, help=argparse.SUPPRESS)
-    _add_quotas(parser)
-
-
-def _add_quotas(parser: argparse.ArgumentParser) -> None:
     for field, (names, meaning, unit) in _QUOTAS.items():
         default: int = getattr(Quotas(), field)
         shown, more = str(default), ""
