@@ -49,7 +49,7 @@ class _Live:
     def drawn(self) -> dict[str, Any] | None:
         """The state if the caller has drawn from the generator; None otherwise."""
         state: Any = self.generator.bit_generator.state
-        return None if _equal(state, self.known) else state
+        return None if equal_states(state, self.known) else state
 
     def references(self) -> tuple[int, int]:
         """The reference counts of the generator and of its bit generator."""
@@ -168,9 +168,11 @@ def _followed(old: _Live, new: _Live) -> _Live:
     return old
 
 
-def _equal(state: Any, other: Any) -> bool:
+def equal_states(state: Any, other: Any) -> bool:
+    """Whether two states of bit generators, or parts of such, are equal."""
     if isinstance(state, dict):
-        return all(_equal(part, other[name]) for name, part in state.items())
+        alike = isinstance(other, dict) and state.keys() == other.keys()
+        return alike and all(equal_states(part, other[name]) for name, part in state.items())
     if isinstance(state, np.ndarray):
         return bool(np.array_equal(state, other))
     return bool(state == other)

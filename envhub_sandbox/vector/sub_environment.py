@@ -18,6 +18,7 @@ from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.errors import UNTRUSTED
+from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.manifest.names import is_servable
 from envhub_worker.protocol.spaces import batches
 
@@ -30,13 +31,16 @@ a nested call for each, of which Python permits about as many."""
 _OURS = frozenset({"_vector", "_index", "_depth"})
 
 
-def _declared(name: str, vector_name: str) -> Any:
-    """A property that the vector environment answers without a request if ``_is_shown``."""
+def _space(name: str) -> Any:
+    """A property that is read in the jail, unless there is none that may have changed the space."""
 
-    def declared(env: SubEnvironment) -> Any:
-        return getattr(env._vector, vector_name) if env._is_shown else env._get(name)
+    @short_traceback
+    def space(env: SubEnvironment) -> Any:
+        runs = env._vector._session.lifecycle.state is State.READY
+        shown = env._is_shown and not runs
+        return getattr(env._vector, f"single_{name}") if shown else env._get(name)
 
-    return property(declared)
+    return property(space)
 
 
 def metadata_of_one(vector: Any) -> dict[str, Any]:
@@ -112,10 +116,13 @@ class SubEnvironment(gym.Env[Any, Any]):
             return wrapped
         return SubEnvironment(self._vector, self._index, self._depth + 1)
 
-    # copies, but the first sub-environment has the vector environment's own objects
-    action_space = _declared("action_space", "single_action_space")
-    observation_space = _declared("observation_space", "single_observation_space")
-    render_mode = _declared("render_mode", "render_mode")
+    action_space = _space("action_space")
+    observation_space = _space("observation_space")
+
+    @property
+    def render_mode(self) -> Any:  # type: ignore[override]
+        """The mode in which it renders."""
+        return self._vector.render_mode if self._is_shown else self._get("render_mode")
 
     @property
     def metadata(self) -> Any:  # type: ignore[override]
@@ -213,7 +220,7 @@ class SubEnvironment(gym.Env[Any, Any]):
             name, self._index, lambda number, row: m.GetOne(number, row, level, name)
         )
         if isinstance(reply, m.Value):
-            return reply.value
+            return self._vector._spaces.of(reply.value)
 
         @short_traceback
         def method(*args: Any, **kwargs: Any) -> Any:
@@ -232,7 +239,7 @@ class SubEnvironment(gym.Env[Any, Any]):
             return m.CallOne(number, row, level, name, *call)
 
         reply = self._vector._requests.ask_one(name, self._index, message)
-        return typed_reply(reply, m.Value).value
+        return self._vector._spaces.of(typed_reply(reply, m.Value).value)
 
     def _restored(self, result: Any) -> Any:
         """The result of a reset or a step, with observations in the classes of the space."""

@@ -30,6 +30,7 @@ from envhub_sandbox.vector.actions import action_reader, check_mask, reset_messa
 from envhub_sandbox.vector.generators import Generators
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.send_recv import SendRecv
+from envhub_sandbox.vector.space_copies import SpaceCopies
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol import messages as m
@@ -84,6 +85,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         self._timeouts = session.repository.timeouts
         self._read_actions = action_reader(manifest, manifest.num_envs)
         self._generators = Generators(self._requests)
+        self._spaces = SpaceCopies(manifest.single_observation_space, manifest.single_action_space)
         self._still: Any = None  # the last picture of the first sub-environment, for notebooks
         self.single_observation_space = manifest.single_observation_space
         self.single_action_space = manifest.single_action_space
@@ -376,8 +378,11 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     def _end_call(self, timeout_s: float | None) -> tuple[Any, ...]:
         replies = self._requests.collect(timeout_s, m.Value)
         if not self._manifest.shardable:
-            return cast("tuple[Any, ...]", replies[0].value)
-        return self._requests.one_each("call", replies)
+            return cast("tuple[Any, ...]", self._spaces.of(replies[0].value))
+        values = self._requests.one_each("call", replies)
+        # AsyncVectorEnv returns a new copy each time
+        copies = self._spaces if self._manifest.sync else SpaceCopies()
+        return cast("tuple[Any, ...]", copies.of(values))
 
     @short_traceback
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -489,12 +494,12 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
             raise absent(self, name, "get_attr")
         reply = self._requests.ask_own("get attribute", m.GetOwn, name)
         if isinstance(reply, m.Value):
-            return reply.value
+            return self._spaces.of(reply.value)
 
         @short_traceback
         def method(*args: Any, **kwargs: Any) -> Any:
             result = self._requests.ask_own(name, m.CallOwn, name, args, kwargs)
-            return typed_reply(result, m.Value).value
+            return self._spaces.of(typed_reply(result, m.Value).value)
 
         return method
 

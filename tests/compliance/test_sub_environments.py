@@ -163,6 +163,56 @@ def test_spaces_specs_and_generators_are_themselves(make: Callable[..., Any]) ->
     assert_same(np.random.default_rng(2).random(), infos["rng"][0].random(), "a draw")
 
 
+class Spaced(gym.Env[Any, Any]):
+    """Has one space under several names, seeds its own, and gets another one."""
+
+    every = spaces.Discrete(70)
+
+    def __init__(self) -> None:
+        self.observation_space, self.action_space = spaces.Box(-1, 1, (2,)), spaces.Discrete(50)
+        self.by_agent = {"a": spaces.Discrete(90), "b": spaces.Discrete(90)}
+        self.several = [self.by_agent["b"], self.every]
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.action_space.seed(seed)
+        return np.zeros(2, np.float32), {}
+
+    def of(self, agent: str) -> gym.Space[Any]:
+        return self.by_agent[agent]
+
+    def grow(self) -> None:
+        self.action_space = spaces.Discrete(99)
+
+
+def test_a_space_is_one_object_however_it_is_read(make: Callable[..., Any]) -> None:
+    """So one ``seed`` holds wherever it is read next, until the environment seeds or replaces it;
+    equal spaces that are two objects there are two here."""
+
+    def draws(space: gym.Space[Any]) -> list[Any]:
+        return [str(space), *(int(space.sample()) for _ in range(5))]
+
+    def drive(env: Any) -> Iterator[Any]:
+        env.reset(seed=1)
+        for one in env.envs:
+            yield draws(one.unwrapped.action_space)
+            one.unwrapped.action_space.seed(3)
+            yield [draws(each.action_space) for each in (one, one.env, one.unwrapped)]
+            one.unwrapped.by_agent["a"].seed(4)
+            one.unwrapped.several[0].seed(5)
+            yield [draws(one.unwrapped.of(agent)) for agent in "ab"]
+            one.unwrapped.every.seed(6)
+        yield draws(env.single_action_space), list(map(draws, env.get_attr("every")))
+        env.call("of", "a")[0].seed(7)
+        yield list(map(draws, env.call("of", "a")))
+        env.reset(seed=8)
+        yield [draws(one.action_space) for one in env.envs], draws(env.single_action_space)
+        env.call("grow")
+        yield [str(each.action_space) for one in env.envs for each in (one, one.unwrapped)]
+
+    env_fns = [lambda: gym.wrappers.TimeLimit(Spaced(), 9)] * 2
+    assert list(drive(make(env_fns))) == list(drive(SyncVectorEnv(env_fns)))
+
+
 def test_one_is_not_closed_under_the_others(make: Callable[..., Any]) -> None:
     env = make(told(2))
     env.reset(seed=0)

@@ -2,6 +2,7 @@
 The controls make of the same fields what they ask for: there memory is asked for without end, a
 command runs, and what one message may cost is not what its parts cost one by one."""
 
+import weakref
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +15,13 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.vector import space_copies
+from envhub_sandbox.vector.space_copies import SpaceCopies
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.wire import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.spaces.spaces import NUMBER, encode_space
 from tests.attacks.client.lies import STATES, nested, pcg64, refuses, relayed, spec_of, started
 from tests.attacks.client.lying_server import Frames, LyingServer
 from tests.support.wire import ext, packed, value
@@ -71,6 +75,8 @@ LIES: dict[str, Frames] = {
     "two descriptions at once": packed([m.Value.kind, [ext(SPACE), {}, {}]]),
     "a description without one": packed([m.Value.kind, [ext(SPACE)]]),
     "a code that there is not": packed([m.Value.kind, [ext(29), {}]]),
+    "a number as text": frames_of(Lie(SPACE, {**box((2,)), "number": "1"})),
+    "a number without end": frames_of(Lie(SPACE, {**box((2,)), "number": 1 << 63})),
     "as a key": packed([m.Value.kind, {(ext(SPEC), 5): 1}]),
 }
 
@@ -126,6 +132,34 @@ def test_described_specs_make_nothing(liar: LyingServer, folder: str, tmp_path: 
     with pytest.raises(Exception):  # noqa: B017,PT011  # what it returns is no environment
         gym.make(EnvSpec(**spec_of(canary)))
     assert canary.exists(), "the control failed: the entry point was not called"
+
+
+def test_a_number_makes_no_space_another(liar: LyingServer, folder: str) -> None:
+    """1 is the number of the single action space. The control is equal to it, and is that space."""
+    equal = encode_space(spaces.Discrete(2))
+    for described in (box((2,)), equal):
+        liar.lies[m.GetOne] = relayed(frames_of(Lie(SPACE, {**described, "number": 1})))
+        with started(liar, folder) as env:
+            own = env.single_action_space
+            assert (env.envs[0].space[0] is own) is (described is equal)
+            assert env.single_action_space is own == spaces.Discrete(2)
+
+
+def test_numbers_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The client forgets spaces before they are many; with a higher bound it keeps all of them."""
+
+    def kept() -> int:
+        copies, sent = SpaceCopies(), []
+        for number in range(100):
+            space = spaces.Box(0, 1, (1 << 17,), np.float32)  # its bounds take 1 MiB
+            vars(space)[NUMBER] = number
+            sent.append(weakref.ref(copies.of(space)))
+        del space
+        return sum(each() is not None for each in sent)
+
+    assert 1 <= kept() <= space_copies.MAX_BYTES >> 20
+    monkeypatch.setattr(space_copies, "MAX_BYTES", 1 << 40)
+    assert kept() == 100, "the control failed: it keeps what it may"
 
 
 def test_described_ids_import_nothing(liar: LyingServer, folder: str) -> None:

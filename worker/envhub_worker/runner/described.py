@@ -12,7 +12,7 @@ import os
 import sys
 import traceback
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -22,8 +22,9 @@ from envhub_worker.file_access import why_file_hidden, why_file_unwritable, why_
 from envhub_worker.protocol.codec.wire import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.errors import EnvHubError
 from envhub_worker.protocol.messages import RaisedException
-from envhub_worker.protocol.spaces.spaces import BIT_GENERATORS, encode_space
+from envhub_worker.protocol.spaces.spaces import BIT_GENERATORS, NUMBER, encode_space
 from envhub_worker.protocol.text import printable
+from envhub_worker.runner.state.space_numbers import SpaceNumbers
 
 SPEC_FIELDS = ("id", "max_episode_steps", "reward_threshold", "nondeterministic")
 
@@ -40,6 +41,14 @@ def described(value: object) -> tuple[int, object] | None:
     except (AttributeError, TypeError, ValueError, EnvHubError):
         pass  # a subclass that is half of one: then its repr has to do
     return None
+
+
+def numbered(numbers: SpaceNumbers, value: object) -> tuple[int, object] | None:
+    """Like ``described``, with the number of a space."""
+    description = described(value)
+    if description is None or description[0] != SPACE:
+        return description
+    return SPACE, {**cast("dict[str, Any]", description[1]), NUMBER: numbers.of(value)}
 
 
 def facts_of(spec: Any) -> dict[str, Any]:

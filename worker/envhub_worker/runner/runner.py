@@ -28,7 +28,7 @@ from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner import loader, manifest
-from envhub_worker.runner.described import described, raised
+from envhub_worker.runner.described import described, numbered, raised
 from envhub_worker.runner.independence import Budget, are_independent
 from envhub_worker.runner.lane import ColumnLane, Lane
 from envhub_worker.runner.prefixes import WarningLog, Watches
@@ -36,6 +36,7 @@ from envhub_worker.runner.recording import standing_in
 from envhub_worker.runner.returned import misfit_in_vector
 from envhub_worker.runner.state import generators
 from envhub_worker.runner.state.shared_state import SharedState
+from envhub_worker.runner.state.space_numbers import SpaceNumbers
 from envhub_worker.runner.sync_envs import Pairs, SubEnvs
 from envhub_worker.runner.tasks import ResultError, Task, tasks_of
 
@@ -116,8 +117,9 @@ class Runner:
         limits: WireLimits = DEFAULT_LIMITS,
         play_bytes: int = 1 << 30,
     ) -> None:
-        self._pack = partial(m.pack, describer=described, limits=limits)
-        self._pack_infos = partial(self._pack, reduces=True)
+        self._numbers = SpaceNumbers()
+        self._pack = partial(m.pack, describer=partial(numbered, self._numbers), limits=limits)
+        self._pack_infos = partial(m.pack, describer=described, limits=limits, reduces=True)
         self._snapshot = snapshot
         self._entry = entry
         self._tasks: dict[tuple[str, Any], Task] = {}
@@ -223,6 +225,7 @@ class Runner:
         if shared is not None:
             env.shared = shared
             shared.built(env.envs)
+        self._numbers.built(_declared_spaces(env), request.start)
         return m.BuildDone(encode_env(manifest.describe_vector(task, env)))
 
     def reset(self, request: m.Reset) -> m.Message:
@@ -396,6 +399,14 @@ class Runner:
         if env is not None:
             env.close()
         return m.Value(None)
+
+
+def _declared_spaces(env: Any) -> list[tuple[Any, Any]]:
+    """Each sub-environment's spaces, or the single ones of a repository's own vector class."""
+    if isinstance(env, SubEnvs):
+        return [(one.observation_space, one.action_space) for one in env.envs]
+    own = getattr(env, "single_observation_space", None), getattr(env, "single_action_space", None)
+    return [own]
 
 
 def _call_own(env: Any, method: str, *args: Any, **kwargs: Any) -> Any:

@@ -16,6 +16,7 @@ from envhub_sandbox.transport.shared_memory import client_slabs
 from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard
 from envhub_sandbox.vector import vector_env
 from envhub_sandbox.vector.sandbox_view import SandboxView
+from envhub_sandbox.vector.space_copies import SpaceCopies
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol import messages as m
@@ -134,7 +135,7 @@ def one_of_two(value: object) -> SubEnvironment:
     space = spaces.Discrete(2)
     manifest = SimpleNamespace(sync=True, shardable=True)
     asked = SimpleNamespace(ask_one=lambda name, index, message: m.Value(value))
-    fields = {"_manifest": manifest, "_requests": asked}
+    fields = {"_manifest": manifest, "_requests": asked, "_spaces": SpaceCopies()}
     vector = SimpleNamespace(num_envs=2, single_observation_space=space, **fields)
     return SubEnvironment(vector, 0)
 

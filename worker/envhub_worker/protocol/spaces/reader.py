@@ -21,6 +21,7 @@ from envhub_worker.protocol.spaces.spaces import (
     GENERATORS,
     INTEGER_DTYPES,
     MAX_SPACE_DEPTH,
+    NUMBER,
     OneOf,
     OpaqueSpace,
     is_charset,
@@ -85,10 +86,14 @@ class SpaceReader:
         """
         self._depth, self._twice = 0, False
         try:
-            if self._generator is None or type(value) is not dict or GENERATORS not in value:
+            if self._generator is None or type(value) is not dict:
                 return self.read(value)
-            space = self.read({k: part for k, part in value.items() if k != GENERATORS})
-            self._start(space, value[GENERATORS], self._generator)
+            about = {k: part for k, part in value.items() if k in (GENERATORS, NUMBER)}
+            space = self.read({k: part for k, part in value.items() if k not in about})
+            if GENERATORS in about:
+                self._start(space, about[GENERATORS], self._generator)
+            if NUMBER in about:
+                vars(space)[NUMBER] = _integer(about[NUMBER], 0, MAX_INT64)
             return space
         except EnvHubError:
             raise

@@ -50,6 +50,9 @@ FIELDS = {
 GENERATORS = "generators"
 """The key of what the generators of a space and its parts are to begin with."""
 
+NUMBER = "number"
+"""The key of a number that a space keeps, so that the client knows it again in another answer."""
+
 # Gymnasium 0.29 has none.
 OneOf: Any = getattr(spaces, "OneOf", None)
 

@@ -1,0 +1,84 @@
+"""The caller's copies of the spaces in the jail: one for each space there, as long as it is equal.
+
+In one process ``env.unwrapped.action_space`` is the same object at each access, so seeding it once
+seeds it for good. Trust: a worker's number of a space chooses only among copies that are equal to
+what it describes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from envhub_sandbox.vector.generators import equal_states
+from envhub_worker.protocol.spaces.spaces import NUMBER, seeded_nodes
+
+MAX_BYTES = 64 << 20
+"""How much a worker may have the client remember; with more, it begins anew."""
+_NODE_BYTES = 4096
+Space = gym.Space[Any]
+
+
+class _Copy:
+    """A copy, and the states that the jail's generators had when it was last described."""
+
+    def __init__(self, space: Space) -> None:
+        self.space = space
+        self._states = _states_of(space)
+
+    def follow(self, described: Space) -> Space:
+        """Take over generators that have changed in the jail, where it has seeded the space."""
+        states = _states_of(described)
+        pairs = zip(states, self._states, strict=True)
+        if any(new is not None and not equal_states(new, old) for new, old in pairs):
+            nodes = seeded_nodes(self.space), seeded_nodes(described)
+            for ours, theirs in zip(*nodes, strict=True):
+                ours._np_random = theirs._np_random or ours._np_random
+        self._states = states
+        return self.space
+
+
+class SpaceCopies:
+    """Knows the spaces of one vector environment again.
+    ``single``: its single observation space and single action space, whose numbers are 0 and 1.
+    """
+
+    def __init__(self, *single: Space) -> None:
+        self._copies = {number: _Copy(space) for number, space in enumerate(single)}
+        self._left = MAX_BYTES
+
+    def of(self, value: Any) -> Any:
+        """A worker's answer, in which known spaces are the caller's copies of them."""
+        if isinstance(value, gym.Space):
+            return self._known(value)
+        if type(value) in (list, tuple):
+            return type(value)(map(self.of, value))
+        return {k: self.of(v) for k, v in value.items()} if type(value) is dict else value
+
+    def _known(self, described: Space) -> Space:
+        number = vars(described).pop(NUMBER, None)
+        copy = self._copies.get(number)
+        if copy and type(copy.space) is type(described) and copy.space == described:
+            return copy.follow(described)
+        if number is not None:
+            self._remember(number, described)
+        return described
+
+    def _remember(self, number: int, space: Space) -> None:
+        self._left -= sum(map(_bytes_of, seeded_nodes(space)))
+        if self._left < 0:
+            self._copies, self._left = {}, MAX_BYTES
+        else:
+            self._copies[number] = _Copy(space)
+
+
+def _states_of(space: Space) -> list[Any]:
+    generators = [node._np_random for node in seeded_nodes(space)]
+    return [None if each is None else each.bit_generator.state for each in generators]
+
+
+def _bytes_of(node: Space) -> int:
+    arrays = (part.nbytes for part in vars(node).values() if isinstance(part, np.ndarray))
+    return _NODE_BYTES + sum(arrays)
