@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
-from gymnasium.vector.utils import iterate
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from envhub_sandbox.factory.make_env import make_env
@@ -26,6 +25,7 @@ from envhub_sandbox.vector.suites import choose, closed_if_it_fails
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.errors import UNTRUSTED
+from envhub_worker.protocol.spaces import batches
 
 _Indices = int | Iterable[int] | None
 
@@ -151,9 +151,11 @@ class SandboxVecEnv(VecEnv):
                 self._begun(ended, infos)
             return batch
         with UNTRUSTED:
-            lasts = list(iterate(self.vector.observation_space, batch))
+            spaces_of_both = self.observation_space, self.vector.observation_space
+            lasts = list(batches.members(*spaces_of_both, batch, self.num_envs))
             for index in ended:
-                infos[index]["terminal_observation"] = lasts[index]
+                last = batches.as_returned(self.observation_space, lasts[index], iter(()))
+                infos[index]["terminal_observation"] = last
         return self._reset(None, None, dones)
 
     def _begun(self, ended: list[int], infos: list[dict[str, Any]]) -> None:
@@ -236,12 +238,15 @@ class SandboxVecEnv(VecEnv):
 
 
 def _batch_of(space: spaces.Space[Any], members: Any) -> Any:
-    """Batch the members of a space: joins mappings and tuples, and returns others unchanged."""
+    """Batch the members of a space: joins mappings and tuples. Others are unchanged, but bits."""
     if isinstance(space, spaces.Dict):
         return {key: _batch_of(sub, [m[key] for m in members]) for key, sub in space.items()}
     if isinstance(space, spaces.Tuple):
         each = enumerate(space.spaces)
         return tuple(_batch_of(sub, [m[index] for m in members]) for index, sub in each)
+    if isinstance(space, spaces.MultiBinary):  # SB3's policies draw float32 bits
+        bits = isinstance(members, np.ndarray) and np.isin(members, (0, 1)).all()
+        return members.astype(space.dtype) if bits else members
     return members
 
 

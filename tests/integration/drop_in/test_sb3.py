@@ -68,13 +68,22 @@ def make_env(n_envs=1, use_async_envs=False):
 """
 _PARTS = """
 class Parts(Still):
-    observation_space = gym.spaces.Discrete(9)
+    observation_space = gym.spaces.Dict(a=gym.spaces.Box(-1, 1, ()))
     action_space = gym.spaces.Dict(a=gym.spaces.Discrete(3), b=gym.spaces.Tuple(
         (gym.spaces.Box(-1, 1, (2,)), gym.spaces.MultiDiscrete([2, 3]))))
 
+    def reset(self, *, seed=None, options=None):
+        return {"a": np.zeros((), np.float32)}, {}
+
     def step(self, action):
-        return 1, 0.0, False, False, {"action": repr(action)}
+        return self.reset()[0], 0.0, True, False, {"action": repr(action)}
 """
+_BITS = (
+    _PARTS.replace("Parts", "Bits").replace("repr(action)", "action.tolist()")
+    + """
+    action_space = gym.spaces.MultiBinary(3)
+"""
+)
 
 
 @pytest.fixture(params=_MODES)
@@ -217,16 +226,22 @@ def test_what_a_wrapper_hides_is_found_behind_it(tmp_path: Path) -> None:
     assert found[0] == found[1]
 
 
-def test_actions_are_one_for_each(tmp_path: Path) -> None:
-    """As ``DummyVecEnv`` takes them, whatever their space; numbers stay what they are."""
-    parts = STILL + _PARTS
-    both = SandboxVecEnv.make(write_repository(tmp_path, parts), n_envs=2), one_of(parts)
+@pytest.mark.parametrize("kind", [_PARTS, _BITS], ids=["parts", "bits"])
+def test_actions_are_one_for_each(tmp_path: Path, kind: str) -> None:
+    """As ``DummyVecEnv`` takes them, whatever their space; a policy draws bits as float32."""
+    both = (
+        SandboxVecEnv.make(write_repository(tmp_path, STILL + kind), n_envs=2),
+        one_of(STILL + kind),
+    )
     for env in both:
         env.action_space.seed(3)
         env.reset()
-    actions = [both[0].action_space.sample() for _ in range(2)]
+    actions: Any = [both[0].action_space.sample() for _ in range(2)]
+    if kind == _BITS:
+        actions = np.array(actions, np.float32)
     ours, theirs = (env.step(actions)[3] for env in both)
     assert ours == theirs
+    assert form(ours[1]["terminal_observation"]) == form(theirs[1]["terminal_observation"])
     both[0].close()
 
 
