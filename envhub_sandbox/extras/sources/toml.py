@@ -14,7 +14,8 @@ else:
 
 _MAX_DOTS = 2000
 """Dots outside of texts: a parser's time grows with the square of the parts of a key."""
-_TEXT = re.compile(r"\"(?:[^\"\\\n]|\\.)*\"|'[^'\n]*'")
+_TEXT = re.compile(r"\"(?:[^\"\\\n]|\\.)*\"?|'[^'\n]*'?")
+"""Also texts without an end, which no document has: else the search begins anew at each quote."""
 _TIME = re.compile(r":\d\d\.\d")
 
 

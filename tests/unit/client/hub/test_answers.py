@@ -2,6 +2,8 @@
 
 import errno
 import itertools
+import subprocess
+import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -66,6 +68,20 @@ def test_dots_in_texts_of_a_generated_document_do_not_count() -> None:
         toml.loads(f'a = "{"." * 3_000}"', 10_000)
     with pytest.raises(ValueError, match="several lines"):
         toml.loads('a = """\nb"""', 100, generated=True)
+
+
+def test_quotes_without_an_end_cost_no_search_each() -> None:
+    """With a search from each quote on, this lock of a stranger's takes a quarter of an hour."""
+    program = f"""
+from {toml.__name__} import loads
+try:
+    loads('a = "' + '\\\\"' * 100_000, 1 << 20, generated=True)
+except ValueError as error:
+    print(error)
+"""
+    words = [sys.executable, "-c", program]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    assert "Unterminated" in done.stdout
 
 
 # --- Answers of a Hub are bounded, and their headers make no hostile names
