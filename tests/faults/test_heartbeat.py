@@ -40,20 +40,6 @@ def test_timeout_tells_what_the_worker_does(
         assert caught.value.worker == (state,)
 
 
-@pytest.mark.usefixtures("neighbour")
-def test_late_reply_survives_the_question(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Asking how it is does not lose the reply: the same process is recovered by ``reset``."""
-    monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 120.0)
-    with started(sample("echo"), policy={"lane": "frames"}, seed=None) as env:
-        before = inside.loaded(env)
-        with halted(inside.pids(env)):
-            env.step_async([[1.0, 0.0]])
-            with pytest.raises(errors.WorkerTimeoutError):
-                env.step_wait(timeout=0.05)
-        env.reset(options={"token": 2.0, "delay": 0.0})
-        assert inside.loaded(env) is before
-
-
 def test_a_task_that_does_not_run_is_not_confined() -> None:
     """Others of its repository may run, and may have run; the provenance still says how."""
     with make_env(sample("many_tasks"), policy={"prewarm": 0}) as suites:
@@ -72,18 +58,21 @@ def test_a_task_that_does_not_run_is_not_confined() -> None:
 
 @pytest.mark.usefixtures("neighbour")
 @pytest.mark.parametrize("lane", ["auto", "frames"])
-def test_a_jail_that_was_lost_confines_nobody(lane: str) -> None:
-    """Until a reset has brought another; while it is merely late it is still the same one."""
+def test_a_jail_that_was_lost_confines_nobody(lane: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until a reset has brought another; while it is merely late it is still the same one, and what
+    it owes survives that somebody asks how it is."""
+    monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 120.0)
     policy = {"restart": "on_reset", "lane": lane}
     with started(sample("echo"), policy=policy, seed=None) as env:
-        report = env.sandbox.report()
+        report, before = env.sandbox.report(), inside.loaded(env)
         assert report
         with halted(inside.pids(env)):
             env.step_async([[1.0, 0.0]])
             with pytest.raises(errors.WorkerTimeoutError):
-                env.step_wait(timeout=0.02)
+                env.step_wait(timeout=0.05)
         assert env.sandbox.report() == report
-        env.reset()
+        env.reset(options={"token": 2.0, "delay": 0.0})
+        assert inside.loaded(env) is before
         with pytest.raises(errors.WorkerDiedError):
             env.step([[1.0, -1.0]])
         assert env.sandbox.report() == []

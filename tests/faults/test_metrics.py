@@ -56,26 +56,44 @@ def repository(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("lane", ["auto", "frames"])
-def test_everything_is_exported(registry: Any, repository: Path, lane: str) -> None:
-    label = f"{repository}:env.py"
+def test_what_happens_is_counted_once_and_exported(
+    registry: Any, repository: Path, lane: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Steps, timeouts, deaths and restarts, over both lanes."""
+    monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 120.0)
     with started(repository, policy={"restart": "on_reset", "lane": lane}, seed=None) as env:
-        for _ in range(7):
+        for _ in range(5):
             env.step([[1.0, 0.0]])
+        with halted(inside.pids(env)):
+            env.step_async([[1.0, 0.0]])
+            with pytest.raises(errors.WorkerTimeoutError):
+                env.step_wait(timeout=0.02)
+        assert env.sandbox.stats()["state"] == "LATE"
+        env.reset()
         with pytest.raises(errors.WorkerDiedError):
             env.step([[1.0, -1.0]])
+        assert env.sandbox.stats()["state"] == "DEAD"
         env.reset()
-        found, told = scraped(registry, label), env.sandbox.stats()
-    assert (told["requests"], told["steps"]) == (10, 7)
+        exported, told = scraped(registry, f"{repository}:env.py"), env.sandbox.stats()
+    assert env.sandbox.stats()["state"] == "CLOSED"
+    latency = told.pop("step_latency_s")
+    assert latency["total"] >= latency["max"]
+    assert 0 < latency["p50"] <= latency["p90"] <= latency["p99"] <= latency["max"]
+    assert told["sent_bytes"] > 6 * 8
+    assert told["received_bytes"] > 6 * (8 + 8 + 1 + 1)
+    counted = {"requests": 3 + 5 + 1 + 1, "steps": 5, "stale_replies": 0, "state": "READY"}
+    once = dict.fromkeys(("timeouts", "deaths", "restarts"), 1)
+    assert told == {**told, **counted, **once}
+    assert len(told) == len(counted) + len(once) + 2
     names = ("requests", "steps", "timeouts", "stale_replies", "sent_bytes", "received_bytes")
     expected = {key(f"envhub_{name}_total"): told[name] for name in names}
     expected |= {key(f"envhub_worker_{name}_total"): 1 for name in ("deaths", "restarts")}
-    latency, of = told["step_latency_s"], "envhub_step_latency_seconds"
-    expected |= {key(f"{of}_count"): 7, key(f"{of}_sum"): latency["total"]}
+    of = "envhub_step_latency_seconds"
+    expected |= {key(f"{of}_count"): 5, key(f"{of}_sum"): latency["total"]}
     for quantile, name in (("0.5", "p50"), ("0.9", "p90"), ("0.99", "p99")):
         expected[key(of, quantile=quantile)] = latency[name]
     expected[key("envhub_environments", state="ready")] = 1
-    assert {name: found[name] for name in expected} == pytest.approx(expected)
-    assert (told["timeouts"], told["stale_replies"]) == (0, 0)
+    assert {name: exported[name] for name in expected} == pytest.approx(expected)
 
 
 def test_counts_outlive_their_environments(registry: Any, repository: Path) -> None:
@@ -145,36 +163,6 @@ def test_names_of_the_worker_cannot_break_the_exposition(
     suites = {dict(labels)["suite"] for _, labels in found}
     assert suites == {'a"b\\c\nd} 5\\x1b[31m'}
     assert counters.LEDGER is not ledger
-
-
-@pytest.mark.parametrize("lane", ["auto", "frames"])
-def test_counters_follow_what_happens(lane: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps, timeouts, deaths and restarts are counted once each, over both lanes."""
-    monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 120.0)
-    policy = {"restart": "on_reset", "lane": lane}
-    with started(sample("echo"), policy=policy, seed=None) as env:
-        for _ in range(5):
-            env.step([[1.0, 0.0]])
-        with halted(inside.pids(env)):
-            env.step_async([[1.0, 0.0]])
-            with pytest.raises(errors.WorkerTimeoutError):
-                env.step_wait(timeout=0.02)
-        assert env.sandbox.stats()["state"] == "LATE"
-        env.reset()
-        with pytest.raises(errors.WorkerDiedError):
-            env.step([[1.0, -1.0]])
-        assert env.sandbox.stats()["state"] == "DEAD"
-        env.reset()
-        found = env.sandbox.stats()
-        latency = found.pop("step_latency_s")
-        assert found.pop("sent_bytes") > 6 * 8
-        assert found.pop("received_bytes") > 6 * (8 + 8 + 1 + 1)
-        counted = {"requests": 3 + 5 + 1 + 1, "steps": 5, "stale_replies": 0}
-        once = dict.fromkeys(("timeouts", "deaths", "restarts"), 1)
-        assert found == {**counted, **once, "state": "READY"}
-        assert latency["total"] >= latency["max"]
-        assert 0 < latency["p50"] <= latency["p90"] <= latency["p99"] <= latency["max"]
-    assert env.sandbox.stats()["state"] == "CLOSED"
 
 
 def test_latencies_are_those_of_the_last_steps() -> None:

@@ -32,17 +32,22 @@ def followers() -> list[threading.Thread]:
 
 
 def test_the_last_words_are_in_the_file(tmp_path: Path) -> None:
-    """Those of a death too, and those of a jail that was ended because it did not answer."""
+    """Those of a death too, and those of a jail that was ended because it did not answer; a jail
+    that follows has a file of its own."""
     died, late = errors.WorkerDiedError, errors.WorkerTimeoutError
     for fault, error, timeout_s in (("exit", died, 60.0), ("hang", late, 1.0)):
-        path = tmp_path / f"{fault}.log"
-        with made(path, fault) as suites:
-            suites.env.reset()
-            suites.env.step_async([0, 1])
-            assert eventually(lambda: "about to" in path.read_text())  # noqa: B023
-            with pytest.raises(error):
-                suites.env.step_wait(timeout=timeout_s)
-        assert path.read_text() == f"about to {fault}\n"
+        folder = tmp_path / fault
+        folder.mkdir()
+        path = folder / "w.log"
+        with made(path, fault, restart="on_reset", restart_backoff_s=0) as suites:
+            for jail in (path, folder / "w-2.log"):
+                suites.env.reset()
+                suites.env.step_async([0, 1])
+                assert eventually(lambda: jail.exists() and "about to" in jail.read_text())  # noqa: B023
+                with pytest.raises(error):
+                    suites.env.step_wait(timeout=timeout_s)
+        texts = {one.name: one.read_text() for one in folder.iterdir()}
+        assert texts == dict.fromkeys(("w.log", "w-2.log"), f"about to {fault}\n")
     assert followers() == []
 
 
@@ -124,17 +129,6 @@ def test_output_of_loading_and_closing_is_there(tmp_path: Path) -> None:
     assert followers() == []
 
 
-def test_a_file_for_each_jail(tmp_path: Path) -> None:
-    with made(tmp_path / "w.log", "kill", restart="on_reset", restart_backoff_s=0) as suites:
-        for _ in range(2):
-            suites.env.reset()
-            with pytest.raises(errors.WorkerDiedError):
-                suites.env.step([0, 1])
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["w-2.log", "w.log"]
-    for path in tmp_path.iterdir():
-        assert path.read_text() == "about to kill\n"
-
-
 def test_a_flood_is_bounded_and_said(tmp_path: Path) -> None:
     path = tmp_path / "w.log"
     with made(path, "flood") as suites:
@@ -189,18 +183,14 @@ def test_the_log_tells_the_life_of_a_jail(caplog: pytest.LogCaptureFixture) -> N
 
 
 def test_an_ordinary_life_clutters_nobodys_log(caplog: pytest.LogCaptureFixture) -> None:
-    """A host program that shows INFO is told what the code sees, and of nothing else."""
+    """A host program that shows INFO is told what the code sees, and of nothing else; nor does a
+    thread follow what nobody wants."""
     caplog.set_level(logging.INFO)
     with made(None, "never") as suites:
         suites.env.reset()
+        assert followers() == []
     [line] = [one.getMessage() for one in caplog.records if one.name.startswith("envhub")]
     assert line.endswith("the code sees 1 file of it")
-
-
-def test_nobody_is_followed_without_need() -> None:
-    with made(None, "exit") as suites:
-        suites.env.reset()
-        assert followers() == []
 
 
 @pytest.mark.parametrize("output", ["stderr", "-"])

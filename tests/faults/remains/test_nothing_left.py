@@ -16,9 +16,6 @@ ENDS = {
         "suites = made()\n"
         "threading.Thread(target=lambda: suites.env.step([0, 0])).start()\nsys.exit(3)"
     ),
-    "os._exit": "suites = made()\nos._exit(4)",
-    "kills itself": "suites = made()\nos.kill(os.getpid(), signal.SIGKILL)",
-    "crashes": "suites = made()\nos.kill(os.getpid(), signal.SIGSEGV)",
     "never used it": "make_env(REPOSITORY)",
     "two shards, an env each": (
         "one = made(use_async_envs=True, num_workers=2)\n"
