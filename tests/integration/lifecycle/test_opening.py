@@ -131,15 +131,11 @@ def started(repository: Path, use_async_envs: bool, **env_kwargs: object) -> int
         return int(env.call("started")[0])
 
 
-@pytest.mark.parametrize(("context", "tasks"), [("fork", 1), ("spawn", 10)])
-def test_a_jail_starts_no_unasked_process(context: str, tasks: int, repository: Path) -> None:
-    """However many tasks there are, and however the repository wanted its processes started."""
+def test_a_jail_starts_no_unasked_process(repository: Path) -> None:
+    """However many tasks there are, and however the repository wanted its processes started.
+    The control: two processes for each of ten tasks, all of which have ended, are counted."""
     plain = started(repository, use_async_envs=False, context=None, tasks=1)
-    assert started(repository, use_async_envs=True, context=context, tasks=tasks) == plain
-
-
-def test_what_the_repository_starts_is_counted(repository: Path) -> None:
-    """The control: two processes for each of ten tasks, all of which have ended."""
-    plain = started(repository, use_async_envs=False, context=None, tasks=1)
+    for context, tasks in (("fork", 1), ("spawn", 10)):
+        assert started(repository, use_async_envs=True, context=context, tasks=tasks) == plain
     arguments = {"context": "fork", "tasks": 10, "looks_into_them": True}
     assert started(repository, use_async_envs=True, **arguments) >= plain + 20

@@ -102,25 +102,21 @@ def settled(tasks: Tasks, expected: list[int]) -> bool:
     return reached and ahead(tasks) == expected
 
 
-def test_the_next_task_is_up_and_built_before_anybody_asks(tasks: Callable[..., Tasks]) -> None:
-    first, second = envs = tasks(2, policy={"prewarm": 1})
+@pytest.mark.parametrize("ahead_of_time", [True, False])
+def test_the_next_task_is_up_and_built_before_anybody_asks(
+    tasks: Callable[..., Tasks], ahead_of_time: bool
+) -> None:
+    """Of the same suite. The control: without it each is made when it is asked."""
+    first, second, *others = envs = tasks(
+        2, policy={"prewarm": int(ahead_of_time)}, env_kwargs={"suites": 2}
+    )
     first.reset()
-    assert eventually(lambda: ahead(envs) == [1])
+    assert settled(envs, [1] if ahead_of_time else [])
     started, asked = descendants(), time.monotonic()
     _, infos = second.reset()
-    assert infos["made"][0] < asked
-    assert descendants() <= started
-
-
-def test_without_it_nothing_is_started_ahead(tasks: Callable[..., Tasks]) -> None:
-    """The control: each task is made when it is asked."""
-    first, second = envs = tasks(2, policy={"prewarm": 0})
-    first.reset()
-    first.close()
-    assert settled(envs, [])
-    asked = time.monotonic()
-    _, infos = second.reset()
-    assert infos["made"][0] > asked
+    assert (infos["made"][0] < asked) == ahead_of_time
+    assert (descendants() <= started) == ahead_of_time
+    assert settled(others, []), "another suite's are not started"
 
 
 @pytest.mark.parametrize("closes", [False, True])
@@ -304,12 +300,6 @@ def test_a_suite_that_nobody_holds_gives_up_what_it_started_ahead(repository: Pa
     assert eventually(lambda: descendants() <= before)
 
 
-def test_suites_do_not_start_each_others_tasks(tasks: Callable[..., Tasks]) -> None:
-    envs = tasks(2, policy={"prewarm": 2}, env_kwargs={"suites": 2})
-    envs[1].reset()
-    assert settled(envs, [])
-
-
 def played(env: Any) -> list[Any]:
     first = env.reset(seed=7)[0].tolist()
     return [first, *([part.tolist() for part in env.step([1])[:4]] for _ in range(5))]
@@ -332,20 +322,12 @@ def _bundles() -> list[Path]:
     return list(folder.iterdir()) if folder.is_dir() else []
 
 
-# --- one environment ------------------------------------------------------------------------
-
-
-@pytest.fixture
-def _known() -> None:
-    """Its manifest is remembered from here on, so that making it again starts nothing."""
-    with make_env(sample("counter"), n_envs=2):
-        pass
-
-
-@pytest.mark.usefixtures("_known")
-def test_the_first_reset_finds_what_was_started() -> None:
-    """One start, before any request; to prewarm what is warm does nothing."""
-    with make_env(sample("counter"), n_envs=2) as suites:
+def test_one_environment_can_be_started_ahead() -> None:
+    """One start, before any request; to prewarm what is warm does nothing. A reset in its midst
+    waits for it, and what fails is raised by the first request."""
+    options: dict[str, Any] = {"cfg": sample("counter"), "n_envs": 2}
+    make_env(**options).close()  # its manifest is remembered: making it again starts nothing
+    with make_env(**options) as suites:
         env = suites.env
         assert env.sandbox.stats()["state"] == "IDLE"
         env.prewarm(), env.prewarm()
@@ -355,15 +337,11 @@ def test_the_first_reset_finds_what_was_started() -> None:
         env.reset(seed=0)
         assert descendants() <= started  # what others left to linger may end meanwhile
         assert env.sandbox.stats()["requests"] == 1
-    with make_env(sample("counter"), n_envs=2) as suites:
+    with make_env(**options) as suites:
         suites.env.prewarm()
-        assert len(suites.env.reset(seed=0)[0]) == 2, "a reset in its midst waits for it"
+        assert len(suites.env.reset(seed=0)[0]) == 2
         assert suites.env.sandbox.stats()["state"] == "READY"
-
-
-@pytest.mark.usefixtures("_known")
-def test_what_fails_ahead_is_raised_by_the_first_request() -> None:
-    with make_env(sample("counter"), n_envs=2, timeouts={"startup_s": 0.001}) as suites:
+    with make_env(**options, timeouts={"startup_s": 0.001}) as suites:
         suites.env.prewarm()
         with pytest.raises(WorkerError):
             suites.env.reset(seed=0)

@@ -73,18 +73,29 @@ def test_the_second_thread_waits(env: Any, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_two_threads_that_step_are_warned_of(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Once, although both get their results in turn; a thread after another is none of it."""
+    """Once, although both get their results in turn; a thread after another is none of it, and one
+    that asks amid an asynchronous call is refused."""
+    refused: list[type] = []
+
+    def step() -> None:
+        try:
+            env.step(ACTIONS)
+        except AlreadyPendingCallError as error:
+            refused.append(type(error))
+
+    def step_elsewhere() -> threading.Thread:
+        thread = threading.Thread(target=step)
+        thread.start()
+        return thread
+
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        first = threading.Thread(target=lambda: env.step(ACTIONS))
-        first.start()
-        first.join(DEADLINE_S)
+        step_elsewhere().join(DEADLINE_S)
         env.step(ACTIONS)
     finish = held_between_the_halves(env, monkeypatch)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        second = threading.Thread(target=lambda: env.step(ACTIONS))
-        second.start()
+        second = step_elsewhere()
         until = time.monotonic() + DEADLINE_S
         while not caught and time.monotonic() < until:
             second.join(0.01)
@@ -94,21 +105,9 @@ def test_two_threads_that_step_are_warned_of(env: Any, monkeypatch: pytest.Monke
     assert warning.category is RuntimeWarning
     assert "two threads step" in str(warning.message)
     assert "/tests/" in warning.filename
-
-
-def test_the_second_thread_is_refused_after_an_async_call(env: Any) -> None:
     env.step_async(ACTIONS)
-    refused: list[type] = []
-
-    def step() -> None:
-        try:
-            env.step(ACTIONS)
-        except AlreadyPendingCallError as error:
-            refused.append(type(error))
-
-    second = threading.Thread(target=step)
-    second.start()
-    second.join(DEADLINE_S)
+    assert refused == []
+    step_elsewhere().join(DEADLINE_S)
     assert refused == [AlreadyPendingCallError]
     assert env.step_wait()[0].shape == (2, 4)
 

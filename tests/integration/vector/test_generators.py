@@ -209,33 +209,27 @@ def test_those_of_a_vector_environment_are_gymnasiums(folder: Path, where: dict[
         assert_same(*played)
 
 
-def test_draws_that_cannot_be_sent_leave_a_way_back(folder: Path) -> None:
-    """A worker that has died takes none; ``send_reset`` starts another."""
-    with make_env(str(folder), n_envs=2, min_ready=1, policy={"restart": "on_reset"}) as suites:
-        env = suites.env
-        env.reset(seed=1)
-        kept = env.np_random
-        for pid in inside.part_pids(inside.parts(env)[0]):
-            os.kill(pid, signal.SIGKILL)
-        kept[0].random()
-        with pytest.raises(WorkerError):
-            env.step([0, 1])
-        env.send_reset(seed=2)
-        assert len(env.recv(min_ready=2)[-1]) == 2
-
-
 def test_send_and_recv_take_the_draws_along(folder: Path) -> None:
-    """Those before the first ``send``; while something is in flight, nobody is asked for more."""
+    """Those before the first ``send``; while something is in flight, nobody is asked for more. A
+    worker that has died takes none; ``send_reset`` starts another."""
     seen = []
-    for env in (_here(folder, n_envs=2), make_env(str(folder), n_envs=2).env):
+    options: dict[str, Any] = {"min_ready": 1, "policy": {"restart": "on_reset"}}
+    for env in (_here(folder, n_envs=2), make_env(str(folder), n_envs=2, **options).env):
         env.reset(seed=1)
         kept = env.np_random
         drawn = [one.random() for one in kept]
         if hasattr(env, "send"):
             env.send([0, 1])
-            result = env.recv()[:2]
+            result = env.recv(2)[:2]
         else:
             result = env.step([0, 1])[:2]
         seen.append([drawn, result, [one.random() for one in kept], env.step([0, 1])[:2]])
-        env.close()
     assert_same(*seen)
+    for pid in inside.part_pids(inside.parts(env)[0]):
+        os.kill(pid, signal.SIGKILL)
+    kept[0].random()
+    with pytest.raises(WorkerError):
+        env.step([0, 1])
+    env.send_reset(seed=2)
+    assert len(env.recv(min_ready=2)[-1]) == 2
+    env.close()

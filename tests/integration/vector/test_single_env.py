@@ -59,12 +59,6 @@ def test_gymnasium_makes_it_by_its_id() -> None:
         envs.close()
 
 
-def test_gymnasiums_classes_are_among_its_direct_bases() -> None:
-    """Some libraries look no further, skrl among them."""
-    assert gym.Env in SandboxEnv.__bases__
-    assert gym.vector.VectorEnv in SandboxVectorEnv.__bases__
-
-
 def test_a_task_is_chosen_by_name() -> None:
     with pytest.raises(ValueError, match=r"\['maze'\]\[0\], \['maze'\]\[1\]"):
         SandboxEnv(EXAMPLES / "two_tasks")
@@ -274,6 +268,30 @@ def test_an_attribute_that_is_set_arrives(env: Any, folder: Path) -> None:
     assert env.reset()[1]["level"] == 5
 
 
+class _Derived(SandboxEnv):
+    """Has attributes of its own."""
+
+    calls = 0
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._mine = 1
+        self.calls = 2
+
+
+def test_what_a_caller_sets_is_no_workers_fault(folder: Path) -> None:
+    """A derived class keeps its own attributes. Results are read by the spaces that were declared.
+    Gymnasium's classes are direct bases: some libraries look no further, skrl among them."""
+    with contextlib.closing(_Derived(folder)) as env:
+        assert (vars(env)["_mine"], env.calls) == (1, 2)
+        assert not env.vector.envs[0].has_wrapper_attr("calls")
+        env.observation_space = gym.spaces.Dict(other=gym.spaces.Discrete(2))
+        assert env.reset(seed=1)[0]["a"] == 0
+        assert type(env.step(1)[0]["a"]) is int
+    assert gym.Env in SandboxEnv.__bases__
+    assert gym.vector.VectorEnv in SandboxVectorEnv.__bases__
+
+
 _EMPTY = """
 import copy
 
@@ -329,31 +347,6 @@ def test_empty_mappings_and_tuples_are_members_too(
             seen.append([begun, *steps, env.reset(seed=2)])
             env.close()
         assert_same(*seen)
-
-
-def test_spaces_that_the_caller_sets_are_not_the_workers_fault(folder: Path) -> None:
-    """Results are read by the spaces that were declared."""
-    with contextlib.closing(SandboxEnv(folder)) as env:
-        env.observation_space = gym.spaces.Dict(other=gym.spaces.Discrete(2))
-        assert env.reset(seed=1)[0]["a"] == 0
-        assert type(env.step(1)[0]["a"]) is int
-
-
-class _Derived(SandboxEnv):
-    """Has attributes of its own."""
-
-    calls = 0
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self._mine = 1
-        self.calls = 2
-
-
-def test_a_derived_class_keeps_its_own_attributes(folder: Path) -> None:
-    with contextlib.closing(_Derived(folder)) as env:
-        assert (vars(env)["_mine"], env.calls) == (1, 2)
-        assert not env.vector.envs[0].has_wrapper_attr("calls")
 
 
 def test_its_actions_and_the_vector_environment_below(env: Any, folder: Path) -> None:

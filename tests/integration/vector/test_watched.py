@@ -141,19 +141,6 @@ def test_every_value_is_the_one_that_is_there(folder: Path, way: dict[str, Any])
         assert env.sandbox.stats()["requests"] < len(requests) - 100  # many were not asked at all
 
 
-def test_an_evaluation_asks_for_its_task_but_twice(folder: Path) -> None:
-    """Once to see that it is asked for again, and once to have it watched."""
-    with make_env(folder, ENVS, num_workers=2) as suites:
-        env = suites.env
-        env.reset()
-        env.get_attr("kind")
-        before = env.sandbox.stats()["requests"]
-        for _ in range(50):
-            env.step(np.zeros(ENVS, np.int64))
-            assert env.call("kind") == ("reacher",) * ENVS
-        assert env.sandbox.stats()["requests"] - before == 50 + 1
-
-
 @pytest.mark.parametrize("way", WAYS, ids=str)
 def test_what_is_absent_is_asked_for_until_watched(folder: Path, way: dict[str, Any]) -> None:
     """The error is then the same, each time another one; and the first that has it is noticed."""
@@ -176,35 +163,28 @@ def test_what_is_absent_is_asked_for_until_watched(folder: Path, way: dict[str, 
         assert env.call("late") == ("task 22",) * ENVS
 
 
-def test_who_waits_for_a_change_sees_it(folder: Path) -> None:
-    """A thread of the repository makes it, with no request in between."""
-    with make_env(folder, ENVS) as suites:
-        env = suites.env
-        env.reset()
-        for _ in range(3):
-            env.step(np.zeros(ENVS, np.int64))
-            assert env.get_attr("ready") == (False,) * ENVS
-        env.call("get_ready")
-        while not all(env.get_attr("ready")):
-            pass
-
-
 def test_who_waits_for_a_signal_is_not_watched(folder: Path) -> None:
-    """It may come between two requests, from a timer or a child."""
+    """It may come between two requests, from a timer or a child. Until then an evaluation asks for
+    its task but twice: to see that it is asked for again, and to have it watched. What a thread of
+    the repository changes, with no request in between, is seen."""
     with make_env(folder, ENVS, num_workers=1) as suites:
         env = suites.env
         env.reset()
         for listens in (False, True):
             if listens:
                 env.call("listen")
-            for _ in range(3):
-                env.step(np.zeros(ENVS, np.int64))
-                env.get_attr("kind")
             before = env.sandbox.stats()["requests"]
-            for _ in range(10):
+            for number in range(10):
                 env.step(np.zeros(ENVS, np.int64))
-                assert env.get_attr("kind") == ("reacher",) * ENVS
-            assert env.sandbox.stats()["requests"] - before == (20 if listens else 10)
+                ask = env.call if number % 2 else env.get_attr
+                assert ask("kind") == ("reacher",) * ENVS
+            assert env.sandbox.stats()["requests"] - before == (20 if listens else 10 + 2)
+        for _ in range(3):
+            env.step(np.zeros(ENVS, np.int64))
+            assert env.get_attr("ready") == (False,) * ENVS
+        env.call("get_ready")
+        while not all(env.get_attr("ready")):
+            pass
 
 
 @pytest.mark.parametrize("way", ["late", "closed"])
