@@ -153,15 +153,12 @@ class WorkerConnection:
                 "the same release of envhub-sandbox on both sides"
             )
         if self._link is not None:
-            self._agree(deadline)
+            reply, _ = self.request(m.Agree(compression.available()), deadline=deadline)
+            agreed = expect_reply(reply, m.Agreement)
+            if agreed.compression not in ("", *compression.available()):
+                raise RemoteProtocolError("the worker chose a compression that was not offered")
+            self._compression, self.patience_s = agreed.compression, agreed.idle_s
         return welcome
-
-    def _agree(self, deadline: Deadline) -> None:
-        reply, _ = self.request(m.Agree(compression.available()), deadline=deadline)
-        agreed = expect_reply(reply, m.Agreement)
-        if agreed.compression not in ("", *compression.available()):
-            raise RemoteProtocolError("the worker chose a compression that was not offered")
-        self._compression, self.patience_s = agreed.compression, agreed.idle_s
 
     def request(
         self, message: m.Message, payload: Sequence[Buffer] = (), *, deadline: Deadline
@@ -208,7 +205,8 @@ class WorkerConnection:
             if isinstance(arrived, EnvHubError):
                 raise arrived
             reply, payload = arrived or self._receive(request_id, deadline)
-            if not self._must_say_hello(request_id, reply):
+            unknown = isinstance(reply, m.Refusal) and reply.error == "HelloError"
+            if not (unknown and request_id in self._sent):
                 self._sent.pop(request_id, None)
                 self._kept.discard(request_id)
                 MESSAGES.debug("< %d %s", request_id, type(reply).__name__)
@@ -329,11 +327,6 @@ class WorkerConnection:
             frames.append(frame.bytes if len(frame) < LARGE_BYTES else frame.buffer)
             more = frame.more
         return frames
-
-    def _must_say_hello(self, request_id: int, reply: m.Message) -> bool:
-        """Whether the request came over a new connection and was refused, so it can be repeated."""
-        unknown = isinstance(reply, m.Refusal) and reply.error == "HelloError"
-        return unknown and request_id in self._sent
 
     def _wait(self, request_id: int, deadline: Deadline) -> None:
         if int(self._socket.getsockopt(_EVENTS)) & _READABLE:

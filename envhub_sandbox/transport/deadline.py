@@ -31,9 +31,7 @@ _LOOK_AGAIN_MS = 100
 
 class Deadline:
     """A point in time. ``Deadline(None)`` never comes.
-
-    Attributes:
-        timeout_s: The seconds from its creation until it comes.
+    ``timeout_s``: the seconds from its creation until it comes.
     """
 
     __slots__ = ("_at", "timeout_s")
@@ -97,9 +95,7 @@ class StepDeadline(Deadline):
     Most replies are there before a wait has to sleep, and a new deadline with a reading of the
     clock costs more than one per cent of a short step. The time that a lane waits awake before
     (a fraction of a millisecond) does not count.
-
-    Attributes:
-        running: Whether it counts already; the caller sets it to False for each step.
+    ``running``: whether it counts already; the caller sets it to False for each step.
     """
 
     __slots__ = ("running",)
@@ -162,9 +158,7 @@ _ADVANTAGE = 0.97
 
 class SpinChooser:
     """Chooses between spinning and sleep. The lane calls ``measured`` once for each step.
-
-    Attributes:
-        budget_ns: How long each side may wait awake; 0 for not at all.
+    ``budget_ns``: how long each side may wait awake; 0 for not at all.
     """
 
     def __init__(self, allowed: bool) -> None:
@@ -238,9 +232,7 @@ def own_cpus() -> list[int]:
 class Cores:
     """Assigns cores to the shards of one environment.
     ``shards``: the number of shards.
-
-    Attributes:
-        awake: The number of shards, counted from the first, with a core that is not the client's.
+    ``awake``: the number of shards, counted from the first, with a core that is not the client's.
     """
 
     def __init__(self, shards: int) -> None:

@@ -82,18 +82,16 @@ def _joined_columns(parts: Sequence[Infos], sizes: Sequence[int], classes: Any) 
         elif type(classes[key]) is dict:
             joined[key] = _joined_columns(values, sizes, classes[key])
         else:
-            joined[key] = _joined_column(values, sizes)
+            for part, size in zip(values, sizes, strict=True):
+                _refuse_unless_column(part, size)
+            first = values[0]
+            is_alike = all(
+                (part.dtype, part.shape[1:]) == (first.dtype, first.shape[1:]) for part in values
+            )
+            joined[key] = np.concatenate(values) if is_alike else None
         if joined[key] is None:
             return None
     return joined
-
-
-def _joined_column(parts: Sequence[Any], sizes: Sequence[int]) -> Any:
-    for part, size in zip(parts, sizes, strict=True):
-        _refuse_unless_column(part, size)
-    first = parts[0]
-    is_alike = all((part.dtype, part.shape[1:]) == (first.dtype, first.shape[1:]) for part in parts)
-    return np.concatenate(parts) if is_alike else None
 
 
 def each_of(part: Infos, size: int) -> OwnInfos:

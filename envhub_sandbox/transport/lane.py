@@ -129,9 +129,7 @@ class Lane:
 
     def send(self, request: Request) -> None:
         """Send each shard its message.
-
-        Raises:
-            EnvHubError: Nothing was sent.
+        Raises ``EnvHubError``: nothing was sent.
         """
         self._asked_ns = perf_counter_ns()
         self._send_to_all(request.operation, request.sent)
@@ -197,10 +195,8 @@ class Lane:
 
     def catch_up(self, deadline: Deadline) -> None:
         """Take the answers that are owed and drop them; raises as ``wait`` does.
-
-        Raises:
-            WorkerError: An interrupt came while the request was sent or its answer read, so the
-                lane does not know what is owed.
+        Raises ``WorkerError``: an interrupt came while the request was sent or its answer read, so
+        the lane does not know what is owed.
         """
         if self._sending or self.jail.client.torn:
             raise WorkerError("the request was interrupted while it was sent, or its answer taken")

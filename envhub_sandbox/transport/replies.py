@@ -181,7 +181,13 @@ _LOADERS_OWN = (".EntryError", ".ArgumentsError")
 
 def raised(reply: m.RaisedException) -> EnvHubError:
     """The error for an exception of the repository. Trust: text from the worker."""
-    reply = _harmless(reply)
+    reply = m.RaisedException(
+        reply.builtin,
+        one_line(reply.type_name, 512),
+        printable(reply.message),
+        printable(reply.traceback, 32_768),
+        reply.stage,
+    )
     if reply.stage not in _LOADING:
         return remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
     failure, message = _LOADING[reply.stage], continued(reply.message)
@@ -196,14 +202,3 @@ def raised(reply: m.RaisedException) -> EnvHubError:
         error = load_error(reply.builtin, f"{failure}: {reply.type_name}: {message}")
     error.__cause__ = cause
     return error
-
-
-def _harmless(reply: m.RaisedException) -> m.RaisedException:
-    """The same message with bounded texts that a terminal can print safely."""
-    return m.RaisedException(
-        reply.builtin,
-        one_line(reply.type_name, 512),
-        printable(reply.message),
-        printable(reply.traceback, 32_768),
-        reply.stage,
-    )

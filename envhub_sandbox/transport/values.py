@@ -157,7 +157,9 @@ class DescriptionReader:
             return self._reader.space(value)
         if code == SPEC:
             self._reader.spend(SPACE_BYTES)
-            return _spec(value)
+            facts = read_spec_facts(value)
+            spec = spec_of(facts)
+            return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if spec is None else spec
         if code == GENERATOR:
             self._reader.spend(GENERATOR_BYTES)
             return generator(value)
@@ -166,13 +168,6 @@ class DescriptionReader:
 
 unpacked = partial(m.unpack, tensors=to_tensor, things=DescriptionReader)
 """``m.unpack`` for a runner's message, which may describe objects. Trust: worker's input."""
-
-
-def _spec(value: object) -> Any:
-    """Make a spec; if this Gymnasium cannot read its id, an object that shows its facts."""
-    facts = read_spec_facts(value)
-    spec = spec_of(facts)
-    return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if spec is None else spec
 
 
 def spec_of(description: dict[str, Any] | None) -> EnvSpec | None:

@@ -42,9 +42,7 @@ class Attachment:
 
     def hand_over(self, index: int, runner: int, shard: LaneShard, deadline: Deadline) -> None:
         """Give a shard's runner its ends of the slabs and doorbells.
-
-        Raises:
-            WorkerDiedError: The runner or the server has ended.
+        Raises ``WorkerDiedError``: the runner or the server has ended.
         """
         # In this order. The bell is watched before a runner can ring it. The server gives the pidfd
         # in exchange for the descriptors, so the death that we watch is that of their new holder;
@@ -98,9 +96,7 @@ def deposit(
     that same server, which drops the connection. So a failed deposit is repeated: descriptors for
     the same runner replace those of the first try. A server that has not yet heard of the jail
     from its zygote says so, and is asked again, too.
-
-    Raises:
-        OSError: The server did not take them.
+    Raises ``OSError``: the server did not take them.
     """
     [frame] = m.pack(m.Deposit(session, jail, runner))
     until, tries = monotonic() + wait_s, 1

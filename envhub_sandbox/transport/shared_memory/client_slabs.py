@@ -277,16 +277,13 @@ class ShardSlabs:
         borrows = slots is not None and slots.chosen != _SPARE
         message = unpacked(frames, limits=limits, borrows=borrows)
         if slots is not None and type(message) is m.StepDone and self._tells[slabs.OFFERED]:
-            self._derive_columns(message, slots.slot_bytes)
+            # 0 until the columns exist: after an interrupt the runner sends none that we lack
+            self._asks[slabs.DERIVED] = 0
+            with suppress(IrregularError):
+                columns = StepColumns(m.values_of(message), slots.slot_bytes)
+                self._form = self._step_columns = columns
+                self._asks[slabs.DERIVED] = self._asks[slabs.SEQUENCE]
         return message
-
-    def _derive_columns(self, message: m.Message, room: int) -> None:
-        # 0 until the columns exist: if this is interrupted, the runner sends no columns that we
-        # lack.
-        self._asks[slabs.DERIVED] = 0
-        with suppress(IrregularError):
-            self._form = self._step_columns = StepColumns(m.values_of(message), room)
-            self._asks[slabs.DERIVED] = self._asks[slabs.SEQUENCE]
 
     def _step_of_columns(self, length: int, slots: SlotRing) -> list[Any]:
         columns = self._step_columns
@@ -403,9 +400,7 @@ class LaneShard(ShardSlabs):
 
     def answered_before_death(self, watch: Watch, deadline: Deadline) -> bool:
         """Sleep until the reply is there or a process dies; returns whether the reply is there.
-
-        Raises:
-            WorkerTimeoutError: The deadline came first.
+        Raises ``WorkerTimeoutError``: the deadline came first.
         """
         self._asks[slabs.PARKED] = 1  # ask the runner to ring our doorbell
         try:
@@ -471,9 +466,7 @@ class JoinedColumns:
 
 def infos_of(shard: ShardSlabs, outcome: Outcome, results: Results) -> dict[Any, Any]:
     """A shard's infos of a step, all of which have arrived. Trust: input from the worker.
-
-    Raises:
-        RemoteEnvError: The environment raised.
+    Raises ``RemoteEnvError``: the environment raised.
     """
     kind, message = outcome
     return shard.columns() if kind == slabs.COLUMNS else results.info(message)

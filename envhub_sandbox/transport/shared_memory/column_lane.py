@@ -33,9 +33,7 @@ _NOTHING: list[Outcome] = []
 
 class ColumnLane(ColumnSteps, SharedMemoryLane):
     """Steps in columns (``ColumnSteps``), messages as in ``SharedMemoryLane``.
-
-    Args:
-        observed: The layout of the observations.
+    ``observed``: the layout of the observations.
     """
 
     shards: list[LaneShard]

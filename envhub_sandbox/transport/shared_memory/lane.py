@@ -98,9 +98,7 @@ class SharedMemoryLane(SlabLane):
         """Make a lane with new slabs; None if they would be too large, or a runner refuses.
         ``slots``: the number of slots for batches; with one, each batch is copied out, with
         several, the caller borrows the slots.
-
-        Raises:
-            WorkerError: A runner died, or took too long.
+        Raises ``WorkerError``: A runner died, or took too long.
         """
         layouts = message_layouts(relay.declared, slots)
         if layouts is None:
@@ -151,16 +149,15 @@ class SharedMemoryLane(SlabLane):
         messages: list[tuple[int, m.Message]] = []
         with self.jail.attaching:
             for index in shards:
-                self._hand_over(index, deadline)
+                try:
+                    self._attachment.hand_over(
+                        index, self.runners[index], self.shards[index], deadline
+                    )
+                except WorkerDiedError as error:  # the server knows why
+                    raise self.jail.cause_of_death("make_env") from error
                 messages.append((self.runners[index], self._attach_message(index)))
             replies = self.jail.exchange("attach", messages, deadline, deposited=True)
         return all(typed_reply(reply, m.Value).value is True for reply in replies)
-
-    def _hand_over(self, index: int, deadline: Deadline) -> None:
-        try:
-            self._attachment.hand_over(index, self.runners[index], self.shards[index], deadline)
-        except WorkerDiedError as error:  # the server knows why
-            raise self.jail.cause_of_death("make_env") from error
 
     def _attach_message(self, index: int) -> m.Attach:
         return m.Attach(self.number, 0, 0, self.slots[index].count)

@@ -62,9 +62,7 @@ class ServedLane(ColumnSteps):
     @classmethod
     def open(cls, relay: Lane, deadline: Deadline) -> ServedLane | None:
         """Make a lane; None if the spaces have no fixed layout, or the server or a runner refuses.
-
-        Raises:
-            WorkerError: A runner died, or took too long.
+        Raises ``WorkerError``: A runner died, or took too long.
         """
         results = relay.declared
         space = results.manifest.single_observation_space
