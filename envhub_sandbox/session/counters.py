@@ -65,7 +65,11 @@ class Counters:
         """Plain numbers: counts, and percentiles of the last step latencies in seconds."""
         numbers = self.numbers()
         seconds = numbers.pop("step_seconds")
-        return {**numbers, "step_latency_s": {**self._percentiles(), "total": seconds}}
+        kept, latency = self.latencies_s(), {}
+        if kept.size:
+            p50, p90, p99 = np.percentile(kept, (50, 90, 99)).tolist()
+            latency = {"p50": p50, "p90": p90, "p99": p99, "max": float(kept.max())}
+        return {**numbers, "step_latency_s": {**latency, "total": seconds}}
 
     def numbers(self) -> dict[str, float]:
         """The counts that only grow; ``step_seconds`` is the sum of all step latencies."""
@@ -85,13 +89,6 @@ class Counters:
     def latencies_s(self) -> Any:
         """The last step latencies, float64 ``(at most KEPT,)``, in no order."""
         return np.array(self._latencies[: min(self.steps, KEPT)], np.float64) / 1e9
-
-    def _percentiles(self) -> dict[str, float]:
-        kept = self.latencies_s()
-        if not kept.size:
-            return {}
-        p50, p90, p99 = np.percentile(kept, (50, 90, 99)).tolist()
-        return {"p50": p50, "p90": p90, "p99": p99, "max": float(kept.max())}
 
 
 _ONCE = ("requests", "steps", "step_seconds")

@@ -70,18 +70,16 @@ def _line(frame: re.Match[str], snapshot: Snapshot) -> str:
     path = printable(str(_place(frame, snapshot)))
     function = frame["function"]
     inside = f", in {one_line(function, _FUNCTION_CHARS)}" if function else ""
-    lines = [f"  File {path}, line {frame['line']}{inside}", *_source(frame)]
-    return "\n    ".join(lines)
-
-
-def _source(frame: re.Match[str]) -> list[str]:
-    """The source line and, for a syntax error, the caret line, with the same indentation."""
     source = (frame["source"] or "").replace("\t", " ")
     text = source.lstrip(" |")
     shown = one_line(text.rstrip(" |"), _SOURCE_CHARS)
     caret = (frame["caret"] or "")[len(source) - len(text) :].replace("\t", " ")
     aligned = text.startswith(shown) and len(caret) <= _SOURCE_CHARS
-    return [line for line in (shown, caret if aligned and not frame["function"] else "") if line]
+    lines = [
+        f"  File {path}, line {frame['line']}{inside}",
+        *[line for line in (shown, caret if aligned and not frame["function"] else "") if line],
+    ]
+    return "\n    ".join(lines)
 
 
 # --- advice on what a jail lacks -----------------------------------------------------------------

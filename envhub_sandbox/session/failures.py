@@ -101,16 +101,13 @@ class Restarts:
             )
         calm = time.monotonic() - self._last >= _CALM_S
         self._in_a_row = 0 if calm else self._in_a_row + 1
-        self._wait(backoff_s(self._policy.restart_backoff_s, self._in_a_row), operation)
-        self._last = time.monotonic()
-        self._counters.restarts += 1
-
-    def _wait(self, wait_s: float, operation: str) -> None:
-        until = time.monotonic() + wait_s
+        until = time.monotonic() + backoff_s(self._policy.restart_backoff_s, self._in_a_row)
         while not self._given_up and (left := until - time.monotonic()) > 0:
             time.sleep(min(left, _LOOK_AGAIN_S))
         if self._given_up:
             raise closed_during(operation)
+        self._last = time.monotonic()
+        self._counters.restarts += 1
 
 
 def backoff_s(first_s: float, in_a_row: int) -> float:

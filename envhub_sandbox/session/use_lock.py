@@ -61,20 +61,13 @@ class UseLock:
             try:
                 yield
             except BaseException as error:
-                self._after_close(operation, error)
+                if self._lease.lifecycle.closed:  # meanwhile, of which the error says nothing
+                    self._lease.let_go()
+                    if isinstance(error, Exception) and not isinstance(error, WorkerDiedError):
+                        raise closed_during(operation) from error
                 raise
             if self._lease.lifecycle.state is State.CLOSED:
                 self._lease.let_go()
-
-    def _after_close(self, operation: str, error: BaseException) -> None:
-        """If ``close`` was called meanwhile, give back jail and server.
-        Raises ``WorkerDiedError``: the environment was closed, and the error does not say so.
-        """
-        if not self._lease.lifecycle.closed:
-            return
-        self._lease.let_go()
-        if isinstance(error, Exception) and not isinstance(error, WorkerDiedError):
-            raise closed_during(operation) from error
 
     @contextmanager
     def judging(self, operation: str) -> Iterator[None]:
@@ -87,16 +80,13 @@ class UseLock:
             except Exception as error:
                 # in any other state the error was handled already, or ended a wait
                 if self._lease.lifecycle.state is State.READY:
-                    self._judge(error)
+                    if is_fault(error):
+                        broken = blamed(error)
+                        self._failures.dead(broken)
+                        raise broken from error
+                    if isinstance(error, RemoteProtocolError):
+                        self._failures.dead(error)
                 raise
-
-    def _judge(self, error: Exception) -> None:
-        if is_fault(error):
-            broken = blamed(error)
-            self._failures.dead(broken)
-            raise broken from error
-        if isinstance(error, RemoteProtocolError):
-            self._failures.dead(error)
 
     def abandon(self) -> None:
         """In a fork, replace the locks, whose holder does not exist: interruption.md, rule 14."""

@@ -254,7 +254,15 @@ class FleetRequests(RequestOrder):
 
         self._send(send)
         self._counters.requests += 1
-        self._recorder.requested(_joined(packed, self.results.bounds))
+        self._recorder.requested(
+            Request(
+                packed[0].operation,
+                [message for request in packed for message in request.messages],
+                [frames for request in packed for frames in request.frames],
+                list(self.results.bounds),
+                plain=all(request.plain for request in packed),
+            )
+        )
 
     def collect(
         self, timeout: float | Deadline | None, kind: type[m.M] | tuple[type[m.M], ...]
@@ -435,14 +443,3 @@ class FleetRequests(RequestOrder):
 
 def _step(actions: Any, number: int, bounds: tuple[int, int]) -> m.Message:
     return m.Step(number, actions)
-
-
-def _joined(requests: Sequence[Request], bounds: Sequence[tuple[int, int]]) -> Request:
-    """Join the parts' requests into one, for the recorder."""
-    return Request(
-        requests[0].operation,
-        [message for request in requests for message in request.messages],
-        [frames for request in requests for frames in request.frames],
-        list(bounds),
-        plain=all(request.plain for request in requests),
-    )

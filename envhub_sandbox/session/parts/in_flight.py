@@ -221,7 +221,13 @@ class InFlight:
             try:
                 while (taken := self._first(min_ready)) is None:
                     for worker in self._wait(deadline):
-                        self._take(worker)
+                        # an error is kept until earlier results were received
+                        try:
+                            self._queues[worker].take(partial(self._keep, worker))
+                        except (EnvHubError, RemoteEnvWarning) as error:
+                            if all(at != worker for at, _ in self._ready):
+                                raise
+                            self._keep(worker, error)
                 return self._joined(taken)
             except Exception:
                 self._order.refuse_if_closed()  # a signal handler may have closed it
@@ -257,15 +263,6 @@ class InFlight:
         if not answered and not late and deadline.passed:
             raise _too_few(deadline)
         return [busy[at] for at in answered or late]
-
-    def _take(self, worker: int) -> None:
-        """Take a worker's oldest answer. An error is kept until earlier results were received."""
-        try:
-            self._queues[worker].take(partial(self._keep, worker))
-        except (EnvHubError, RemoteEnvWarning) as error:
-            if all(at != worker for at, _ in self._ready):
-                raise
-            self._keep(worker, error)
 
     def _keep(self, worker: int, result: StepResult | Exception) -> None:
         self._ready.append((worker, result))
