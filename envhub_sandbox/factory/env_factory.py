@@ -115,6 +115,11 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
         arguments = b"".join(map(bytes, m.pack(load, pickler=partial(pickled, lasting=True))))
     except (EnvHubError, TypeError):
         return None
+    # the interpreter, and the times when packages were last installed into it
+    python = runtime.python or sys.executable
+    prefix = Path(python).parent.parent
+    own = sorted(prefix.glob("lib/python3*/site-packages"))
+    folders = [Path(runtime.packages)] if runtime.packages else own
     facts = (
         *(_FORMAT, m.VERSION, _code_of(Path(protocol.__file__).parent.parent)),
         *(snapshot.repo_type, snapshot.repo_id, snapshot.commit, snapshot.path),
@@ -122,7 +127,7 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
         *(policy.profile, policy.network, policy.readable, policy.gpu, policy.environment),
         policy.display,
         policy.record_denials,  # a host may refuse it, and the cache must not hide that
-        *_facts_of(runtime.python or sys.executable, runtime.packages),
+        *(python, _stamp(Path(python)), *((str(path), _stamp(path)) for path in folders)),
     )
     digest = hashlib.sha256(arguments)
     digest.update(repr(facts).encode())
@@ -140,14 +145,6 @@ def _code_of(worker: Path) -> str:
     code = [path for path in files if path.suffix == ".py"]
     changes = sorted((str(path.relative_to(worker)), _stamp(path)) for path in code)
     return hashlib.sha256(repr(changes).encode()).hexdigest()
-
-
-def _facts_of(python: str, packages: str) -> tuple[object, ...]:
-    """The interpreter, and the times when packages were last installed into it."""
-    prefix = Path(python).parent.parent
-    own = sorted(prefix.glob("lib/python3*/site-packages"))
-    folders = [Path(packages)] if packages else own
-    return (python, _stamp(Path(python)), *((str(path), _stamp(path)) for path in folders))
 
 
 def _stamp(path: Path) -> int:
@@ -209,7 +206,10 @@ class EnvFactory:
             if is_used and any(
                 e.shardable and not e.sync and e.num_envs > 1 for e in manifest.envs
             ):
-                loaded = self._open_again(loaded, deadline)
+                self._launcher.close(loaded)  # what was played in it may have written files
+                played = loaded.manifest
+                with repository.named():
+                    loaded = self._open(deadline, ExpectedManifest(played, played.envs[0]))
             suites = self._suites(loaded.manifest, loaded)
             repository.warnings.show(repository.label)
             return suites
@@ -221,13 +221,6 @@ class EnvFactory:
         ask = partial(self._launcher.open, deadline, expected)
         return retry_while_busy(ask, self._launcher.retry_s, deadline, self._repository.label)
 
-    def _open_again(self, played: LoadedJail, deadline: Deadline) -> LoadedJail:
-        """Replace a jail in which sub-environments were played, and may have written files."""
-        self._launcher.close(played)
-        manifest = played.manifest
-        with self._repository.named():
-            return self._open(deadline, ExpectedManifest(manifest, manifest.envs[0]))
-
     def _suites(self, manifest: Manifest, loaded: LoadedJail | None) -> EnvSuites:
         repository = self._repository
         alone = manifest.lazy or len(manifest.envs) == 1
@@ -235,7 +228,12 @@ class EnvFactory:
         makers = [partial(self._session, manifest, env, shared) for env in manifest.envs]
         sessions = [make() for make in makers]
         if loaded is not None and shared is None:
-            self._use(loaded, sessions)
+            # the only task gets the jail that described the repository; a suite closes it
+            if len(sessions) == 1:
+                with self._repository.named():
+                    sessions[0].prewarms[0].adopt(loaded)
+            else:
+                self._launcher.close(loaded)
         envs: dict[str, dict[Any, Any]] = {}
         suites: dict[str, list[list[Prewarm]]] = {}
         for session, again in zip(sessions, makers, strict=True):
@@ -290,14 +288,6 @@ class EnvFactory:
             for launcher, rows in seats
         ]
         return FleetSession(parts, recorder)
-
-    def _use(self, loaded: LoadedJail, sessions: list[AnySession]) -> None:
-        """Give the jail that described the repository to its only task; a suite closes it."""
-        if len(sessions) == 1:
-            with self._repository.named():
-                sessions[0].prewarms[0].adopt(loaded)
-        else:
-            self._launcher.close(loaded)
 
 
 def _each(launcher: Launcher, start: int, stop: int) -> Iterator[tuple[Launcher, tuple[int, int]]]:

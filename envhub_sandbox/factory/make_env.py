@@ -189,10 +189,13 @@ def _suites(snapshot: Snapshot, config: Any, plan: _Plan, options: Options) -> E
         advice=partial(plan.source.advice, snapshot, plan.sandbox.name, packages is not None),
         of_its_day=partial(plan.source.of_its_day, snapshot, target),
     )
+    prewarm = plan.policy.prewarm
+    if prewarm is None and (options.sandbox != "process" or plan.policy.gpu):
+        prewarm = 0  # it would use a shared resource: a container's memory, a key's quota, a GPU
     return EnvFactory(
         _launchers(repository, plan.sandbox, options),
         options.num_workers,
-        _ahead(plan, options),
+        prewarm,
         partial(plan.source.check, label=snapshot.label, env_kwargs=load.env_kwargs, config=config),
     ).make()
 
@@ -231,7 +234,12 @@ def _plan(sandbox: str | Sandbox, options: Options) -> _Plan:
     runtime = Runtime(interpreter(source.python))
     chosen.note_interpreter(runtime)
     if chosen.is_here:
-        check_executable(runtime.python)
+        program = runtime.python
+        if program and not (os.path.isfile(program) and os.access(program, os.X_OK)):
+            raise PolicyError(
+                f"{option_name('python')} is {program!r}, which is not a program; it takes the "
+                "path of an interpreter, such as '.venv/bin/python'"
+            )
         check_readable(policy.readable)
     return _Plan(chosen, policy, timeouts, source, runtime)
 
@@ -245,16 +253,6 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     further = dict(options.env_kwargs or {})
     envs = inprocess.make(snapshot, options.n_envs, options.use_async_envs, config, further)
     return EnvSuites(envs, partial(provenance_of, snapshot, None, []))
-
-
-def _ahead(plan: _Plan, options: Options) -> int | None:
-    """How many tasks to start ahead; by default none if that would use a shared resource: a
-    container's memory, a key's quota, a GPU.
-    """
-    prewarm = plan.policy.prewarm
-    if prewarm is None and (options.sandbox != "process" or plan.policy.gpu):
-        return 0
-    return prewarm
 
 
 # --- reading arguments
@@ -329,15 +327,6 @@ def interpreter(python: str | Path | None) -> str:
     text = os.path.expanduser(python)
     program = shutil.which(text) if os.sep not in str(text) else None
     return os.path.abspath(program or text)
-
-
-def check_executable(python: str) -> None:
-    """Raise ``PolicyError`` if an interpreter of this machine cannot be run."""
-    if python and not (os.path.isfile(python) and os.access(python, os.X_OK)):
-        raise PolicyError(
-            f"{option_name('python')} is {python!r}, which is not a program; it takes the path of "
-            "an interpreter, such as '.venv/bin/python'"
-        )
 
 
 def check_readable(paths: Iterable[str]) -> None:

@@ -208,6 +208,13 @@ def explain(
     known_kinds = ((kind, link) for link in chain(error) if (kind := _kind_of(link)) is not None)
     kind, source = next(known_kinds, (Kind.OTHER, error))
     response = getattr(source, "response", None)
+    message = _header(response, "X-Error-Message")
+    words = "".join(c if c.isprintable() else " " for c in message)[:_LONGEST_QUOTE]
+    seconds = _header(response, "Retry-After")
+    # the exception's class, and the text of the innermost system error in its chain
+    texts = [str(link) for link in chain(source) if isinstance(link, OSError) and str(link)]
+    text = _LOGIN.sub("***", printable([str(source), *texts][-1])[:_LONGEST_QUOTE])
+    text = " ".join(text.split())
     fields = {
         "repo_type": repo_type,
         "repo_id": repo_id,
@@ -215,21 +222,13 @@ def explain(
         "url": f"{endpoint}/{'' if repo_type == 'model' else f'{repo_type}s/'}{repo_id}",
         "revision": repr(revision) if revision else "'main' (is it empty?)",
         "status": getattr(response, "status_code", "not found"),
-        "said": _said(response),
-        "wait": _wait(response),
-        "reason": _reason(source),
+        "said": f'; it said: "{words}"' if words else "",
+        "wait": f"{int(seconds)} s" if seconds.isdecimal() else "a few minutes",
+        "reason": f"{type(source).__name__}: {text}" if text else type(source).__name__,
         "no_token": option_name("token", False),
     }
     failure, advice = (text.format(**fields) for text in kind.value)
     return HubFailure(kind, redact(failure, secrets), redact(advice, secrets))
-
-
-def _reason(error: BaseException) -> str:
-    """The exception's class, and the text of the innermost system error in its chain."""
-    texts = [str(link) for link in chain(error) if isinstance(link, OSError) and str(link)]
-    text = _LOGIN.sub("***", printable([str(error), *texts][-1])[:_LONGEST_QUOTE])
-    text = " ".join(text.split())
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def redact(text: str, secrets: tuple[str, ...]) -> str:
@@ -298,17 +297,6 @@ _KIND_OF_STATUS = {
     408: Kind.TIMEOUT,
     429: Kind.RATE_LIMITED,
 }
-
-
-def _said(response: object) -> str:
-    message = _header(response, "X-Error-Message")
-    words = "".join(c if c.isprintable() else " " for c in message)[:_LONGEST_QUOTE]
-    return f'; it said: "{words}"' if words else ""
-
-
-def _wait(response: object) -> str:
-    seconds = _header(response, "Retry-After")
-    return f"{int(seconds)} s" if seconds.isdecimal() else "a few minutes"
 
 
 def _header(response: object, name: str) -> str:

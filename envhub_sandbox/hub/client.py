@@ -153,7 +153,9 @@ class HubClient:
                     "pages without a file. Check that the endpoint is a Hugging Face Hub"
                 )
             yield from files
-            query = _next_page(following, query)
+            # only its query is used: with another host the link could send the token elsewhere
+            further = None if following is None else dict(parse_qsl(urlsplit(following).query))
+            query = None if further == query else further
 
     @contextmanager
     def files(self, repo: Repository, commit: str) -> Iterator[CommitFiles]:
@@ -253,7 +255,12 @@ class HubClient:
             raise
         except Exception as error:
             # first: the exception becomes the cause of ours, and tracebacks show its text
-            secrets = self._secrets()
+            from huggingface_hub import get_token
+
+            token = self.token if isinstance(self.token, str) else get_token()
+            login = login_of(self.endpoint)
+            sent = (token, *self._login()[0].values(), login and login[1])
+            secrets = tuple(secret for secret in sent if secret)
             conceal(error, secrets)
             hostile = [link for link in chain(error) if isinstance(link, HostileAnswerError)]
             if hostile:
@@ -264,22 +271,6 @@ class HubClient:
                 ) from error
             subject = {**repo._asdict(), "revision": revision, "endpoint": self.public_endpoint}
             raise explain(error, secrets, **subject) from error
-
-    def _secrets(self) -> tuple[str, ...]:
-        from huggingface_hub import get_token
-
-        token = self.token if isinstance(self.token, str) else get_token()
-        login = login_of(self.endpoint)
-        secrets = (token, *self._login()[0].values(), login and login[1])
-        return tuple(secret for secret in secrets if secret)
-
-
-def _next_page(url: str | None, query: dict[str, str]) -> dict[str, str] | None:
-    """The query of the next page. Its host is ignored, or a link could send the token elsewhere."""
-    if url is None:
-        return None
-    following = dict(parse_qsl(urlsplit(url).query))
-    return following if following != query else None
 
 
 def _record_of(item: Any, repo: Repository) -> FileRecord | None:

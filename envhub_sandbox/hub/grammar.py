@@ -324,15 +324,12 @@ def _read_page(steps: list[str]) -> Parts:
         return _with_path(kind, repo_id, *_split_revision(rest))
     if page in ("commit", "commits") and rest:
         return parts_of(kind, repo_id, _split_revision(rest)[0], DEFAULT_PATH)
-    raise _wrong_page(Parts(repo_id, repo_type=kind), page, rest)
-
-
-def _wrong_page(parts: Parts, page: str, rest: list[str]) -> Wrong:
+    parts = Parts(repo_id, repo_type=kind)
     write = repr(join(parts))
     if page == "discussions" and rest and rest[0].isdigit():
         pull_request = join(parts._replace(revision=f"refs/pr/{rest[0]}"))
         write += f", or {pull_request!r} for the pull request"
-    return Wrong(f"the page {page!r} of a repository is not a file", write)
+    raise Wrong(f"the page {page!r} of a repository is not a file", write)
 
 
 def _read_git(_: str, rest: str) -> Parts:

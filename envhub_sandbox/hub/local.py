@@ -127,9 +127,7 @@ class Listing(NamedTuple):
 class LocalFolder:
     """A folder of this machine, by a path without links; without a checkout, every file is in the
     snapshot.
-
-    Attributes:
-        entry: The file, if a file was named; the snapshot then has what this file's code may see.
+    ``entry``: the file, if a file was named; the snapshot then has what this file's code may see.
     """
 
     root: Path

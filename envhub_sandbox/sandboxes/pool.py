@@ -202,20 +202,17 @@ class ServerPool(Generic[S]):
             if self._used.get(slot) is entry:
                 del self._used[slot]
             if idle_s != 0 and not self._ends and entry.server.runs:
-                self._keep(entry, None if idle_s is None else monotonic() + idle_s)
+                for other in self._mine():
+                    other.until = 0.0
+                entry.until = None if idle_s is None else monotonic() + idle_s
+                if entry not in self._idle:  # an interrupted release may have added it
+                    self._idle.append(entry)
+                self._watch()
                 return True
         entry.server.stop()
         return True
 
     # --- idle servers; the lock is held ----------------------------------------------------------
-
-    def _keep(self, entry: _Entry[S], until: float | None) -> None:
-        for other in self._mine():
-            other.until = 0.0
-        entry.until = until
-        if entry not in self._idle:  # an interrupted release may have added it
-            self._idle.append(entry)
-        self._watch()
 
     def _take(self, key: Hashable) -> _Entry[S] | None:
         """Take an idle server with this key, or None; the thread ends one that has died."""

@@ -224,22 +224,18 @@ def _execute(
         *("--ahead", "--python", runtime.python, "--packages", runtime.packages),
     ]
     with (server.folder / "server.log").open("wb") as log, pidfd() as ourselves:
+        kept = {name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ}
+        # one thread: the server computes nothing, and idle threads of OpenBLAS spin at first
         return subprocess.Popen(
             [*arguments, "--ready-fd", str(ready), "--client-pidfd", str(ourselves)],
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
             cwd="/",
-            env=_environment(),
+            env={**kept, "OPENBLAS_NUM_THREADS": "1"},
             pass_fds=(ready, ourselves),
             start_new_session=True,  # Ctrl-C is for the client, which then closes us
         )
-
-
-def _environment() -> dict[str, str]:
-    kept = {name: os.environ[name] for name in _KEPT_VARIABLES if name in os.environ}
-    # one thread: the server computes nothing, and idle threads of OpenBLAS spin at first
-    return {**kept, "OPENBLAS_NUM_THREADS": "1"}
 
 
 def _wait_until_ready(ready: int, server: LocalServer) -> None:
@@ -284,7 +280,8 @@ def _made(prefix: str) -> Path:
     """Make a folder in the first of the ``places`` that permits it."""
     why = ""
     for parent in places():
-        if _is_short(parent):
+        # only on Linux the folder has sockets
+        if not IS_LINUX or len(os.fsencode(parent) + os.fsencode(_LONGEST)) <= _SOCKET_BYTES:
             try:
                 return Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
             except OSError as error:
@@ -305,12 +302,6 @@ def places() -> list[Path]:
     if os.path.isabs(own) and user_id() != 0:  # root's jails are another user
         parents.append(Path(own))
     return list(dict.fromkeys([*parents, *([] if IS_WINDOWS else [Path("/tmp")])]))
-
-
-def _is_short(folder: Path) -> bool:
-    if not IS_LINUX:  # the folder has no sockets there
-        return True
-    return len(os.fsencode(folder) + os.fsencode(_LONGEST)) <= _SOCKET_BYTES
 
 
 def stale_folders(parent: Path) -> Iterator[Path]:

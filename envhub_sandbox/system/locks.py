@@ -47,14 +47,6 @@ def lock(descriptor: int, *, shared: bool = False, wait: bool = False) -> None:
         fcntl.flock(descriptor, kind if wait else kind | fcntl.LOCK_NB)
 
 
-def unlock(descriptor: int) -> None:
-    """Release the lock, even if a fork has a copy of the descriptor, which would keep it held."""
-    if sys.platform == "win32":
-        _lock_byte(descriptor, msvcrt.LK_UNLCK)
-    else:
-        fcntl.flock(descriptor, fcntl.LOCK_UN)
-
-
 def _lock_byte(descriptor: int, how: int) -> None:
     if sys.platform == "win32":
         before = os.lseek(descriptor, 0, os.SEEK_CUR)
@@ -99,8 +91,11 @@ def held(
         time.sleep(_POLL_S)
     try:
         yield descriptor
-    finally:
-        unlock(descriptor)
+    finally:  # a close alone would keep it locked while a fork has a copy of the descriptor
+        if sys.platform == "win32":
+            _lock_byte(descriptor, msvcrt.LK_UNLCK)
+        else:
+            fcntl.flock(descriptor, fcntl.LOCK_UN)
         os.close(descriptor)
 
 

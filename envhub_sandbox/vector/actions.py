@@ -164,19 +164,15 @@ def seeds_for_all(seed: Any, manifest: EnvManifest) -> Any:
         each = list(seed)
     except TypeError:
         raise SeedError(seed) from None
-    seeds = [None if seed is None else _seed(seed) for seed in each]
-    if len(seeds) != count:
+    for seed in each:
+        if not (seed is None or isinstance(seed, int)):
+            raise SeedError(seed)
+    if len(each) != count:
         raise ValueError(
             "If seeds are passed as a list the length must match "
-            f"num_envs={count} but got length={len(seeds)}."
+            f"num_envs={count} but got length={len(each)}."
         )
-    return seeds
-
-
-def _seed(seed: Any) -> int:
-    if not isinstance(seed, int):
-        raise SeedError(seed)
-    return seed
+    return each
 
 
 def check_mask(mask: Any, num_envs: int) -> None:

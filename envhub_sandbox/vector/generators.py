@@ -63,9 +63,7 @@ _UNKEPT = _Live(np.random.Generator(np.random.PCG64(0)), 0).references()
 class Generators:
     """The generators of a vector environment: one for each sub-environment, or one for all.
     ``requests``: the requests of the vector environment.
-
-    Attributes:
-        single: Whether a repository's own class has one generator; known after the first read.
+    ``single``: whether a repository's own class has one generator; known after the first read.
     """
 
     def __init__(self, requests: RequestOrder) -> None:

@@ -56,7 +56,10 @@ class SendRecv(VectorEnv[Any, Any, Any]):
             flight = self._in_flight()
             rows = flight.rows(env_ids)
             self._send_draws()
-            flight.send(rows, self._read_rows(rows, actions))
+            count = len(rows.named)
+            if count not in self._readers:
+                self._readers[count] = action_reader(self._manifest, count)
+            flight.send(rows, self._readers[count](actions))
 
     @short_traceback
     def send_reset(
@@ -144,13 +147,6 @@ class SendRecv(VectorEnv[Any, Any, Any]):
             parts = [session] if isinstance(session, EnvSession) else session.parts
             self._flight = InFlight(self._requests, parts)
         return self._flight
-
-    def _read_rows(self, rows: Rows, actions: Any) -> Any:
-        """Check the batch of actions for some sub-environments, as a batch for all is checked."""
-        count = len(rows.named)
-        if count not in self._readers:
-            self._readers[count] = action_reader(self._manifest, count)
-        return self._readers[count](actions)
 
 
 def _seeds_of(rows: Rows, seed: Any, manifest: EnvManifest) -> Any:

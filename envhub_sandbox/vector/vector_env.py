@@ -217,16 +217,13 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
             mask = options.pop("reset_mask")
             check_mask(mask, self.num_envs)
         seeds = seeds_for_all(seed, self._manifest)
-        self._recover()
-        self._requests.submit("reset", reset_message(self._manifest, seeds, options, mask))
-
-    def _recover(self) -> None:
         try:
             self._session.recover()
         except BaseException as error:
             self._requests.explain(error)
             raise
         self._requests.show_warnings()
+        self._requests.submit("reset", reset_message(self._manifest, seeds, options, mask))
 
     @short_traceback
     def reset_wait(self, timeout: float | None = None) -> tuple[Any, dict[str, Any]]:
