@@ -267,9 +267,11 @@ class RemoteEnvError(EnvHubError):
         self.line = 0
 
     def __reduce__(self) -> tuple[object, ...]:
+        name = type(self).__name__.removeprefix("Remote")
+        builtin = name if (RemoteEnvError, name) in _TWINS else f"{_GYMNASIUM}.{name}"
         return (
             remote_error,
-            (_builtin_of(type(self)), self.type_name, self.message, self.traceback),
+            (builtin, self.type_name, self.message, self.traceback),
             {**vars(self), "args": self.args},  # args: the text with its source
         )
 
@@ -363,11 +365,6 @@ def _nearest(ours: type[EnvHubError], builtin: str) -> Any:
     ancestors = kind.__mro__ if isinstance(kind, type) else ()
     candidates = (_TWINS.get((ours, ancestor.__name__)) for ancestor in ancestors)
     return next((twin for twin in candidates if twin is not None), ours)
-
-
-def _builtin_of(cls: type[RemoteEnvError]) -> str:
-    name = cls.__name__.removeprefix("Remote")
-    return name if (RemoteEnvError, name) in _TWINS else f"{_GYMNASIUM}.{name}"
 
 
 def remote_error(builtin: str, type_name: str, message: str, traceback: str = "") -> RemoteEnvError:

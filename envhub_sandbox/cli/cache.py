@@ -105,16 +105,12 @@ def _read(record: Path) -> StoredSnapshot | None:
         return None
     home = record.parent
     revision = document.get("revision")
-    repository = _repository(document)
-    folder = str(document.get("repo_id")) if repository == FOLDER else None
-    return StoredSnapshot(repository, home.name, revision, used, size, home, folder)
-
-
-def _repository(document: dict[str, Any]) -> str:
     kind, name = document.get("repo_type"), str(document.get("repo_id"))
     prefixes = {"space": "spaces/", "dataset": "datasets/", "pypi": "pypi:"}
     prefixes["git"] = f"git+{document.get('endpoint')}/"
-    return FOLDER if kind == FOLDER else prefixes.get(str(kind), "") + name
+    repository = FOLDER if kind == FOLDER else prefixes.get(str(kind), "") + name
+    folder = str(document.get("repo_id")) if repository == FOLDER else None
+    return StoredSnapshot(repository, home.name, revision, used, size, home, folder)
 
 
 @opt.with_options()

@@ -60,19 +60,15 @@ class EnvHubCollector(Collector):
             for row in rows:
                 counter.add_metric(_values(row), row.numbers[number])
             yield counter
-        yield _states(rows)
+        gauge = GaugeMetricFamily(
+            "envhub_environments", "Environments, by their state.", labels=(*_LABELS, "state")
+        )
+        for row in rows:
+            for state, count in row.states.items():
+                if state != "CLOSED":
+                    gauge.add_metric([*_values(row), state.lower()], count)
+        yield gauge
         yield _latency(rows)
-
-
-def _states(rows: list[Row]) -> Metric:
-    gauge = GaugeMetricFamily(
-        "envhub_environments", "Environments, by their state.", labels=(*_LABELS, "state")
-    )
-    for row in rows:
-        for state, count in row.states.items():
-            if state != "CLOSED":
-                gauge.add_metric([*_values(row), state.lower()], count)
-    return gauge
 
 
 def _latency(rows: list[Row]) -> Metric:

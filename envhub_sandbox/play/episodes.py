@@ -126,13 +126,6 @@ class EpisodeCounter:
         played = ~self._resetting
         terminated = self._flags("terminations", terminations)
         done = (terminated | self._flags("truncations", truncations)) & played
-        self._add(rewards, played)
-        self.steps += int(played.sum())
-        for index in np.flatnonzero(done):
-            self._end(int(index), bool(terminated[index]), infos)
-        self._prepare_next(done, infos)
-
-    def _add(self, rewards: Any, played: Bools) -> None:
         numbers = self._numbers(rewards)
         if self._returns is None:
             self._returns = np.zeros_like(numbers)
@@ -142,6 +135,14 @@ class EpisodeCounter:
             )
         self._returns[played] += numbers[played]
         self._lengths[played] += 1
+        self.steps += int(played.sum())
+        for index in np.flatnonzero(done):
+            self._end(int(index), bool(terminated[index]), infos)
+        if self._mode is None and done.any():
+            final = isinstance(infos, Mapping) and any(key in infos for key in _FINAL_KEYS)
+            self._mode = "SameStep" if final else "NextStep"
+        self.reset_mask = done if self._mode == "Disabled" and done.any() else None
+        self._resetting = done if self._mode == "NextStep" else np.zeros_like(done)
 
     def _end(self, index: int, terminated: bool, infos: Any) -> None:
         assert self._returns is not None
@@ -158,13 +159,6 @@ class EpisodeCounter:
             )
         self._returns[index] = 0
         self._lengths[index] = 0
-
-    def _prepare_next(self, done: Bools, infos: Any) -> None:
-        if self._mode is None and done.any():
-            final = isinstance(infos, Mapping) and any(key in infos for key in _FINAL_KEYS)
-            self._mode = "SameStep" if final else "NextStep"
-        self.reset_mask = done if self._mode == "Disabled" and done.any() else None
-        self._resetting = done if self._mode == "NextStep" else np.zeros_like(done)
 
     def _numbers(self, rewards: Any) -> Floats:
         count = len(self._left)

@@ -81,7 +81,10 @@ class _SafeStream:
         """Write text that no CI system obeys."""
         written = neutralised(text, self._line)
         self._stream.write(written)
-        self._line = _end_of_line(self._line + written)
+        # the end of the last line, which the next write may complete to a command
+        line = re.split(f"[{_BREAK}]", self._line + written)[-1]
+        start = re.sub(rf"\A{_SPACE}", "", line)
+        self._line = start if start in ("", ":") else f"x{start[-_TAIL:]}"
         return len(text)
 
     def writelines(self, lines: Sequence[str]) -> None:
@@ -94,13 +97,6 @@ class _SafeStream:
         begin = "\n" if self._line else ""
         self._stream.write(f"{begin}{line[:2]}{neutralised(line[2:], 'x')}\n")
         self._line = ""
-
-
-def _end_of_line(text: str) -> str:
-    """Return the end of the last line, which the next write may complete to a command."""
-    line = re.split(f"[{_BREAK}]", text)[-1]
-    start = re.sub(rf"\A{_SPACE}", "", line)
-    return start if start in ("", ":") else f"x{start[-_TAIL:]}"
 
 
 @contextlib.contextmanager

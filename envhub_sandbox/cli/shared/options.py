@@ -110,26 +110,23 @@ def _parameter(key: str, others: Sequence[str], defaults: Mapping[str, Any]) -> 
     if key == "sandbox" and "trust_remote_code" in others:
         text = "Where it runs; 'none' is this process, unprotected."
         declared = replace(declared, metavar=f"{declared.metavar}|none", help=text)
+    # for a shell's completion: the parts of the metavar in lower case
+    parts = (declared.metavar or "").split("|")
+    matches = [re.match(r"[a-z][a-z:/-]*", part) for part in parts]
+    words = [match[0] for match in matches if match is not None]
     option = typer.Option(
         *declared.command.split(),
         help=declared.help,
         metavar=declared.metavar,
         min=declared.least,
         max=declared.most,
-        autocompletion=_completion(declared.metavar or ""),
+        autocompletion=words.copy if words else None,
         rich_help_panel=declared.panel,
     )
     default = defaults.get(key, declared.default)
     kind: Any = list[str] if declared.kind in (list, dict) else declared.kind
     annotation: Any = Annotated[kind if default is not None else kind | None, option]
     return _keyword(declared.parameter, default, annotation)
-
-
-def _completion(metavar: str) -> Callable[[], list[str]] | None:
-    """Return the values for a shell's completion: the parts of a metavar in lower case."""
-    matches = [re.match(r"[a-z][a-z:/-]*", word) for word in metavar.split("|")]
-    words = [match[0] for match in matches if match is not None]
-    return words.copy if words else None
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,10 @@ def _mean(stats: dict[str, float] | None, *, spread: bool = False) -> str:
 
 def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:
     """Print the repository, the interpreter and packages, and the confinement of a run."""
-    show("repository", _repository(provenance))
+    kind = provenance["repo_type"]
+    word, dash, digits = provenance["commit"].rpartition("-")
+    commit = f"{word}{dash}{digits[:_SHOWN_DIGITS]}" if dash else digits
+    show("repository", f"{provenance['repository']} ({kind}) at {commit}, {provenance['path']}")
     for asset in provenance.get("assets") or ():
         show("could read", str(asset))
     interpreter = provenance.get("interpreter") or {}
@@ -138,13 +141,6 @@ def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:
         show("ran on", text)
     for title, text in _confinement(provenance, in_process):
         show(title, text)
-
-
-def _repository(provenance: dict[str, Any]) -> str:
-    kind = provenance["repo_type"]
-    word, dash, digits = provenance["commit"].rpartition("-")
-    commit = f"{word}{dash}{digits[:_SHOWN_DIGITS]}" if dash else digits
-    return f"{provenance['repository']} ({kind}) at {commit}, {provenance['path']}"
 
 
 def _interpreter(interpreter: dict[str, str], packages: dict[str, str], names: set[str]) -> str:

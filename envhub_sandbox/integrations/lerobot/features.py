@@ -158,19 +158,15 @@ def left_out(observations: Space[Any], seen: Mapping[str, Feature]) -> list[str]
 def _passed_on(name: str, space: Space[Any], others: bool) -> Iterator[tuple[str, Feature]]:
     """Yield the features that ``preprocess_observation`` makes of one key."""
     if name == "pixels":
-        yield from _pixels(space)
+        # one camera, or several by name; each has the shape (height, width, channels)
+        if isinstance(space, Dict):
+            yield from _cameras(space, space.spaces, "pixels")
+        elif isinstance(space, Box) and len(space.shape) == 3:
+            yield "pixels", Feature(OBS_IMAGE, FeatureType.VISUAL, space.shape, "pixels")
     elif name in _NAMED and isinstance(space, Box):
         yield name, Feature(*_NAMED[name], space.shape, name)
     elif others and name not in _NESTED and isinstance(space, Box) and len(space.shape) == 1:
         yield name, Feature(f"{OBS_STR}.{name}", FeatureType.STATE, space.shape, name)
-
-
-def _pixels(space: Space[Any]) -> Iterator[tuple[str, Feature]]:
-    """Yield one camera, or several by name; each has the shape (height, width, channels)."""
-    if isinstance(space, Dict):
-        yield from _cameras(space, space.spaces, "pixels")
-    elif isinstance(space, Box) and len(space.shape) == 3:
-        yield "pixels", Feature(OBS_IMAGE, FeatureType.VISUAL, space.shape, "pixels")
 
 
 def _cameras(space: Any, names: Any, source: str) -> Iterator[tuple[str, Feature]]:
