@@ -98,10 +98,11 @@ def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
         raise BundleError("its file hashes are not text")
     task = document.get("task")
     are_steps = [isinstance(message, m.Step) for message in _messages(packets)]
+    crashes = (cache_root() / "crashes").resolve()
     return Bundle(
         label=one_line(_member(document, "label", str), 1000),
         reference=_reference(provenance),
-        is_ours=_is_ours(folder.resolve()),
+        is_ours=folder.resolve().parent == crashes and folders.is_ours_alone(crashes),
         files=files,
         death=_death(_member(document, "death", dict)),
         load=_load(folder),
@@ -111,11 +112,6 @@ def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
         count=len(are_steps),
         steps=sum(are_steps),
     )
-
-
-def _is_ours(folder: Path) -> bool:
-    crashes = (cache_root() / "crashes").resolve()
-    return folder.parent == crashes and folders.is_ours_alone(crashes)
 
 
 def _reference(provenance: dict[str, Any]) -> str:

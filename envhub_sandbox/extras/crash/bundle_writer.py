@@ -53,7 +53,15 @@ def write_bundle(folder: Path, crash: Crash, requests: Sequence[list[bytes]]) ->
     """
     folders.make(folder, folders.PRIVATE_MODE)
     with folders.draft(folder) as building:
-        _write(building, crash, requests)
+        load = encoded(crash.load)
+        content = {
+            "bundle.json": json.dumps(_document(crash), indent=1, default=str).encode(),
+            "arguments.bin": packet(load),
+            "requests.bin": b"".join(map(packet, requests)),
+            "README.txt": _concealed(_in_words(crash, load, requests), crash).encode(),
+        }
+        for name, data in content.items():
+            folders.write_private(building / name, data)
         home = folder / f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{secrets.token_hex(4)}"
         building.rename(home)
     _remove_oldest(folder, home.name)
@@ -75,18 +83,6 @@ def _is_old(path: Path) -> bool:
     with contextlib.suppress(OSError):
         return time.time() - path.stat().st_mtime > _ABANDONED_AFTER_S
     return False
-
-
-def _write(folder: Path, crash: Crash, requests: Sequence[list[bytes]]) -> None:
-    load = encoded(crash.load)
-    content = {
-        "bundle.json": json.dumps(_document(crash), indent=1, default=str).encode(),
-        "arguments.bin": packet(load),
-        "requests.bin": b"".join(map(packet, requests)),
-        "README.txt": _concealed(_in_words(crash, load, requests), crash).encode(),
-    }
-    for name, data in content.items():
-        folders.write_private(folder / name, data)
 
 
 def _document(crash: Crash) -> dict[str, Any]:

@@ -95,16 +95,12 @@ def _chosen(wanted: Container, surroundings: Surroundings) -> Iterator[tuple[str
     ):
         if most is not None:
             holds = has is not None and has <= most * 1.01
-            yield f"container-{name}", holds, _amount(name, most)
-
-
-def _amount(name: str, most: float) -> str:
-    amounts = {
-        "memory": f"{most / _MIB:.0f} MiB for all jails and the server",
-        "pids": f"{most:.0f} processes and threads",
-        "cpus": f"the time of {most:g} processors",
-    }
-    return amounts[name]
+            amounts = {
+                "memory": f"{most / _MIB:.0f} MiB for all jails and the server",
+                "pids": f"{most:.0f} processes and threads",
+                "cpus": f"the time of {most:g} processors",
+            }
+            yield f"container-{name}", holds, amounts[name]
 
 
 def _absent(wanted: Container) -> list[dict[str, Any]]:

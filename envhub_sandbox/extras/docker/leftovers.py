@@ -59,7 +59,14 @@ class Leftover:
         if self.kind == "folder":
             shutil.rmtree(self.name, ignore_errors=True)
             return not os.path.exists(self.name)
-        return _remove_groups(Path(self.name))
+        folder = Path(self.name)
+        # a server that has just made it takes the lock next, and makes another if it is gone
+        with contextlib.suppress(OSError), unheld(folder) as free:
+            for inner in [path for path in folder.iterdir() if free and path.is_dir()]:
+                inner.rmdir()
+            if free:
+                folder.rmdir()
+        return not folder.exists()
 
 
 class Found(NamedTuple):
@@ -112,7 +119,8 @@ def stale_containers(engine: Engine) -> Iterator[Leftover]:
         with contextlib.suppress(EngineError, ValueError):  # it may have gone meanwhile
             description = json.loads(engine.run("inspect", container))[0]
             labels = description["Config"]["Labels"]
-            if _is_mine(labels.get(USER_LABEL)) and _is_deserted_container(description):
+            is_ours = user_id() == 0 or labels.get(USER_LABEL) == str(user_id())
+            if is_ours and _is_deserted_container(description):
                 yield Leftover("container", description["Name"].lstrip("/"), engine)
 
 
@@ -125,10 +133,6 @@ def _is_deserted_container(description: dict[str, Any]) -> bool:
         return description["State"]["Status"] in _ENDED
     except OSError:
         return False
-
-
-def _is_mine(user: str | None) -> bool:
-    return user_id() == 0 or user == str(user_id())
 
 
 def stale_groups(root: Path) -> Iterator[Leftover]:
@@ -144,13 +148,3 @@ def _is_deserted_group(folder: Path) -> bool:
     processes = folder / "cgroup.procs"
     used = processes.exists() and processes.read_text()
     return not used and os.access(folder, os.W_OK) and not is_held(folder)
-
-
-def _remove_groups(folder: Path) -> bool:
-    # a server that has just made it takes the lock next, and makes another if it is gone
-    with contextlib.suppress(OSError), unheld(folder) as free:
-        for inner in [path for path in folder.iterdir() if free and path.is_dir()]:
-            inner.rmdir()
-        if free:
-            folder.rmdir()
-    return not folder.exists()

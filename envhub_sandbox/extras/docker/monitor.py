@@ -41,13 +41,15 @@ def main(argv: Sequence[str]) -> int:
     finally:
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):
             # --rm has usually removed it by now; an engine that was restarted may have kept it
-            _quietly([command[0], "rm", "--force", "--volumes", name], _REMOVE_S)
+            nothing = subprocess.DEVNULL
+            subprocess.run(
+                [command[0], "rm", "--force", "--volumes", name],
+                stdin=nothing,
+                stdout=nothing,
+                stderr=nothing,
+                timeout=_REMOVE_S,
+            )
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _quietly(command: list[str], timeout_s: float) -> None:
-    nothing = subprocess.DEVNULL
-    subprocess.run(command, stdin=nothing, stdout=nothing, stderr=nothing, timeout=timeout_s)
 
 
 class ContainerMonitor:
@@ -103,19 +105,16 @@ class ContainerMonitor:
         lifeline, self._process.stdin = self._process.stdin, None
         assert lifeline is not None
         lifeline.close()
-        code = self._wait()
-        tail = self._tail.decode("utf-8", "replace")
-        self._tell(json.dumps({"ended": code, "tail": tail}).encode())
-        return code
-
-    def _wait(self) -> int:
-        """Wait for the server, which ends when its stdin does; unread output would block it."""
+        # the server ends when its stdin does; unread output would block it
         try:
             rest, _ = self._process.communicate(timeout=_END_S)
             self._tail = (self._tail + rest)[-_TAIL_BYTES:]
         except subprocess.TimeoutExpired:
             self._process.kill()
-        return self._process.wait()
+        code = self._process.wait()
+        tail = self._tail.decode("utf-8", "replace")
+        self._tell(json.dumps({"ended": code, "tail": tail}).encode())
+        return code
 
 
 if __name__ == "__main__":

@@ -126,10 +126,10 @@ def interpreter_fitting(theirs: Interpreter, request: PackageRequest) -> Interpr
     Raises ``DependencyError``: there is none.
     """
     versions_asked = SpecifierSet(request.supports)
-    if not theirs.fits(versions_asked) or (
-        request.python and not _is_asked(theirs, request.python)
-    ):
-        wanted = request.python or str(versions_asked)
+    asked = request.python
+    is_asked = not asked or ("/" not in asked and theirs.fits(versions(asked)))
+    if not (is_asked and theirs.fits(versions_asked)):
+        wanted = asked or str(versions_asked)
         raise DependencyError(
             f"it needs Python {wanted}, and the image has {theirs.version}: build envhub-worker "
             "from another base (docs/deployment.md)",
@@ -154,10 +154,6 @@ def interpreter_fitting(theirs: Interpreter, request: PackageRequest) -> Interpr
             reason="interpreter",
         )
     return ours
-
-
-def _is_asked(theirs: Interpreter, text: str) -> bool:
-    return "/" not in text and theirs.fits(versions(text))
 
 
 def _remedy() -> str:
@@ -251,7 +247,13 @@ def derived(
     ``SandboxUnavailableError``: the base is not an image of envhub-worker, or does not exist.
     """
     identity, target = find_image(engine, base), target_of(engine, base)
-    _check_python(request, target)
+    versions_asked = versions(request.python) & SpecifierSet(request.supports)
+    if os.sep in request.python or not versions_asked.contains(f"{target.version}.99"):
+        raise DependencyError(
+            f"{request.source} asks for Python {request.python or request.supports}, and the image "
+            f"has {target.version}: build envhub-worker from another base (docs/deployment.md)",
+            reason="interpreter",
+        )
     tell(f"choosing versions for {request.source}")
     lock, guesses = versions_for(request, lambda asked: resolve(asked, target, tell=tell))
     tag = tag_for(name, identity, lock, system)
@@ -260,16 +262,6 @@ def derived(
         tell(f"building the image {tag}")
         build(engine, dockerfile(base, lock, system), lock, tag, network)
     return DerivedImage(tag, is_new, lock, tuple(guess.module for guess in guesses))
-
-
-def _check_python(request: PackageRequest, target: Target) -> None:
-    versions_asked = versions(request.python) & SpecifierSet(request.supports)
-    if os.sep in request.python or not versions_asked.contains(f"{target.version}.99"):
-        raise DependencyError(
-            f"{request.source} asks for Python {request.python or request.supports}, and the image "
-            f"has {target.version}: build envhub-worker from another base (docs/deployment.md)",
-            reason="interpreter",
-        )
 
 
 class BuiltImageTarget(ImageTarget):

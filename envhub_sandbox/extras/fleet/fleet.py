@@ -79,20 +79,15 @@ class Fleet(Sandbox):
         """
 
         def sandbox_of(sandbox: str | Sandbox) -> Sandbox:
-            if is_fleet(sandbox):
+            if isinstance(sandbox, (list, tuple, Fleet)) or (
+                isinstance(sandbox, str) and is_list(sandbox)
+            ):
                 raise PolicyError("a fleet cannot be a place of a fleet: name its places")
             if isinstance(sandbox, str) and sandbox.startswith("tcp://"):
                 return RemoteSandbox(sandbox, **self.remote)
             return resolve(sandbox)
 
         return OpenFleet(places_of(self.places), sandbox_of)
-
-
-def is_fleet(sandbox: object) -> bool:
-    """Whether a value of ``sandbox`` names a fleet."""
-    return isinstance(sandbox, (list, tuple, Fleet)) or (
-        isinstance(sandbox, str) and is_list(sandbox)
-    )
 
 
 class OpenFleet(Sandbox):

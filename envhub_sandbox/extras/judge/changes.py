@@ -59,7 +59,9 @@ class Change:
 
 def changes(then: Static, now: Static) -> list[Change]:
     """Lists all differences, in the order of ``Change.what``."""
-    other = _other(then, now)
+    # the files in both commits whose bytes differ
+    before, after = _records(then), _records(now)
+    other = set(differing(now.snapshot.root, after.values(), before.values())) & set(before)
     return [
         *_files(then, now, other),
         *_value("entry", _entry(then), _entry(now)),
@@ -76,12 +78,6 @@ def _rank(change: Change) -> int:
 
 def _records(read: Static) -> dict[str, FileRecord]:
     return {file.record.path: file.record for file in read.files}
-
-
-def _other(then: Static, now: Static) -> set[str]:
-    """Returns the files in both commits whose bytes differ."""
-    before, after = _records(then), _records(now)
-    return set(differing(now.snapshot.root, after.values(), before.values())) & set(before)
 
 
 def _files(then: Static, now: Static, other: Collection[str]) -> Iterator[Change]:

@@ -77,14 +77,10 @@ def kind_of_contents(name: str, beginning: bytes, ending: bytes = b"") -> str:
         return "machine code"
     if _PICKLE.match(beginning):
         return "pickle"
-    if _is_archive(beginning, ending) and (suffix not in _NO_ARCHIVES or _may_hold_code(ending)):
+    of_a_kind = beginning.startswith(_ARCHIVES) or beginning[257:262] == b"ustar"
+    if (of_a_kind or _ZIP_END in ending) and (suffix not in _NO_ARCHIVES or _may_hold_code(ending)):
         return "archive"
     return "text" if _is_text(beginning) else "binary"
-
-
-def _is_archive(beginning: bytes, ending: bytes) -> bool:
-    of_a_kind = beginning.startswith(_ARCHIVES) or beginning[257:262] == b"ustar"
-    return of_a_kind or _ZIP_END in ending
 
 
 def _may_hold_code(ending: bytes) -> bool:

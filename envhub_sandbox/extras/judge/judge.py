@@ -61,10 +61,8 @@ class _StoppedError(Exception):
 
 def judge(asked: JudgeOptions, report: Report | None = None) -> Report:
     """Judges a repository; ``report`` takes each finding at once, so that an interrupt loses none.
-
-    Raises:
-        EnvHubError: The repository could not be judged: it is unreachable, this host cannot
-            confine it, or a server is full. A fault of the repository itself is a finding.
+    Raises ``EnvHubError``: the repository could not be judged: it is unreachable, this host cannot
+    confine it, or a server is full. A fault of the repository itself is a finding.
     """
     asked.tell(f"reading {asked.reference}")
     where = {name: asked.arguments.get(name) for name in ("hub_cache_dir", "token", "endpoint")}

@@ -128,7 +128,11 @@ def _plots(play: Play) -> Iterator[str]:
     drawn = [
         _plot(f"{of}, per episode", _mean(returns), bar_plot(f"{of} of each episode", returns)),
         _plot("Length of episodes", _mean(lengths), bar_plot("Length of each episode", lengths)),
-        _plot("Time of a step", _median(times), histogram_plot("Times of steps", times)),
+        _plot(
+            "Time of a step",
+            f"median {duration_text(float(np.median(times)))}" if times else "",
+            histogram_plot("Times of steps", times),
+        ),
         _plot("Memory", "", line_plot("Memory of its processes", play.memory, parts)),
     ]
     if not play.episodes and play.step_s:
@@ -149,10 +153,6 @@ def _plot(name: str, figure: str, svg: str) -> str:
 def _mean(values: Sequence[float]) -> str:
     numbers = finite(values)
     return f"mean {number(float(np.mean(numbers)))}" if len(numbers) else ""
-
-
-def _median(seconds: Sequence[float]) -> str:
-    return f"median {duration_text(float(np.median(seconds)))}" if seconds else ""
 
 
 def _figures(report: Report) -> Iterator[str]:

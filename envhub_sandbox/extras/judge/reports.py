@@ -128,19 +128,15 @@ def _result(finding: Finding, failures: Sequence[Finding], folder: str) -> dict[
     }
     if finding.line:
         location["region"] = {"startLine": finding.line}
+    # SARIF has links and placeholders in texts
+    plain = re.sub(r"([\\\[\]])", r"\\\1", f"{prefix}{finding.message}")
     return {
         "ruleId": finding.id,
         "level": finding.check.severity.value,
-        "message": {"text": _sarif_text(f"{prefix}{finding.message}")},
+        "message": {"text": plain.replace("{", "{{").replace("}", "}}")},
         "locations": [{"physicalLocation": location}],
         "properties": {"fails": finding in failures},
     }
-
-
-def _sarif_text(text: str) -> str:
-    """Escapes SARIF's embedded links and placeholders."""
-    plain = re.sub(r"([\\\[\]])", r"\\\1", text)
-    return plain.replace("{", "{{").replace("}", "}}")
 
 
 def workflow_commands(report: Report) -> Iterator[str]:

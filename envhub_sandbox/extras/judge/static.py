@@ -153,7 +153,11 @@ def _in_place(snapshot: Snapshot) -> Iterator[Finding]:
     try:
         folder = LocalFolder.of(snapshot)
         if not isinstance(folder.checkout, Checkout):
-            yield from _links_of_folder(folder)
+            # links that the copy of a folder followed; their targets lie inside the folder
+            for file in folder.files():
+                if file.source != folder.root / file.path:
+                    target = file.source.relative_to(folder.root)
+                    yield Finding("source-link", f"a link to {target}", file=file.path)
             if is_unread(folder.root):
                 message = "git cannot say what its commit has: is it installed? Are its ids SHA-1?"
                 yield Finding("source-uncommitted", message)
@@ -174,14 +178,6 @@ def _links(snapshot: Snapshot) -> Iterator[Finding]:
         if target is not None:
             message = f"reads like a link of git's, to {target}"
             yield Finding("source-link", message, file=record.path)
-
-
-def _links_of_folder(here: LocalFolder) -> Iterator[Finding]:
-    """Finds links that the copy of a folder followed; their targets lie inside the folder."""
-    for file in here.files():
-        if file.source != here.root / file.path:
-            target = file.source.relative_to(here.root)
-            yield Finding("source-link", f"a link to {target}", file=file.path)
 
 
 def _uncommitted(checkout: Checkout, snapshot: Snapshot) -> Iterator[Finding]:
@@ -359,7 +355,10 @@ def undeclared(
         packages: The environment made from them; None if this interpreter serves.
         taken: Modules installed although undeclared, and the packages that need them.
     """
-    brought = _of_this_interpreter({} if packages else stated)
+    wanted = [*map(Requirement, WORKERS), *({} if packages else stated).values()]
+    brought = {
+        module for distribution in interpreters.brought(wanted) for module in _modules(distribution)
+    }
     if packages:
         brought |= {path.name.partition(".")[0] for path in packages.iterdir()}
     missing = [
@@ -374,13 +373,6 @@ def undeclared(
         Finding("imports", f"{what}, and nothing declares it", "", file, line)
         for what, file, line in found_at
     ]
-
-
-def _of_this_interpreter(declared: Mapping[str, Requirement]) -> set[str]:
-    wanted = [*map(Requirement, WORKERS), *declared.values()]
-    return {
-        module for distribution in interpreters.brought(wanted) for module in _modules(distribution)
-    }
 
 
 def _modules(found: metadata.Distribution) -> set[str]:

@@ -142,7 +142,9 @@ def declared(root: Path, entry: str) -> DeclaredPackages | None:
     script = _script(root / entry, entry)
     if script is not None:
         return script
-    project = _project(root)
+    stated, origin = table(pyproject(root), "project"), f"[project] of {PROJECT}"
+    python = _specifier(stated.get("requires-python", ""), origin)
+    project = DeclaredPackages(PROJECT, _list(stated.get("dependencies", []), origin), python)
     beside = os.path.join(os.path.dirname(entry), "requirements.txt")
     names = (beside, "requirements.txt")
     listed = next((name for name in names if (root / name).is_file()), None)
@@ -330,13 +332,6 @@ def _block(lines: Sequence[str], start: int) -> str | None:
             closed = len(inside)
         inside.append(line[2:])
     return None if closed is None else "\n".join(inside[:closed])
-
-
-def _project(root: Path) -> DeclaredPackages:
-    project = table(pyproject(root), "project")
-    origin = f"[project] of {PROJECT}"
-    python = _specifier(project.get("requires-python", ""), origin)
-    return DeclaredPackages(PROJECT, _list(project.get("dependencies", []), origin), python)
 
 
 def pyproject(root: Path, where: str = PROJECT) -> dict[str, Any]:

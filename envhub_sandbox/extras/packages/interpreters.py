@@ -158,7 +158,12 @@ def _others(wanted: SpecifierSet) -> list[Interpreter]:
             timeout_s=_FIND_S,
             variables={"PATH": search},
         )
-        paths += [str(row["path"]) for row in json.loads(answer) if _may_be(row)]
+        kind = ("default", "cpython")  # a variant, such as 3.14t, has another ABI
+        paths += [
+            str(row["path"])
+            for row in json.loads(answer)
+            if (row.get("variant", "default"), row.get("implementation")) == kind
+        ]
     except (DependencyError, ValueError, LookupError, TypeError):
         pass  # uv finds no interpreter
     newest: dict[str, Interpreter] = {}
@@ -172,11 +177,6 @@ def _answering(paths: Iterable[str]) -> Iterator[Interpreter]:
     for path in dict.fromkeys(map(os.path.realpath, paths)):
         with contextlib.suppress(DependencyError):
             yield _at(path)
-
-
-def _may_be(row: dict[str, object]) -> bool:
-    """Tells whether a row of uv's list may fit: 3.14t, for example, has another ABI."""
-    return (row.get("variant", "default"), row.get("implementation")) == ("default", "cpython")
 
 
 class InstalledPackage(NamedTuple):
@@ -241,7 +241,9 @@ def _reached(
     while waiting:
         wanted, extras = waiting.pop()
         try:
-            if not _applies(wanted, extras, environment):
+            marker = wanted.marker
+            each = ({**environment, "extra": extra} for extra in extras or ("",))
+            if not (marker is None or any(marker.evaluate(variables) for variables in each)):
                 continue
         except (ValueError, LookupError):  # uv will report the marker
             yield wanted, None
@@ -252,12 +254,6 @@ def _reached(
         if found is not None and key not in met:
             met.add(key)
             waiting += [(requirement, key[1]) for requirement in _needs(found)]
-
-
-def _applies(wanted: Requirement, extras: frozenset[str], environment: dict[str, str]) -> bool:
-    marker = wanted.marker
-    each = ({**environment, "extra": extra} for extra in extras or ("",))
-    return marker is None or any(marker.evaluate(variables) for variables in each)
 
 
 def _distribution(name: str) -> metadata.Distribution | None:

@@ -64,7 +64,12 @@ def connect(address: str = "") -> None:
 
     with _connecting:
         if ray.is_initialized():
-            _check_address(address, str(ray.get_runtime_context().gcs_address))
+            connected = str(ray.get_runtime_context().gcs_address)
+            if address not in ("", "auto", "local", connected) and "://" not in address:
+                raise PolicyError(
+                    f"RaySandbox(address={address!r}): this process is connected to the cluster at "
+                    f"{connected}. Leave the address out, or call ray.shutdown() first"
+                )
             return
         try:
             is_local = _started_here(address)
@@ -89,14 +94,6 @@ def _started_here(address: str) -> bool:
         ray.init(address="local", include_dashboard=False)
         return True
     return False
-
-
-def _check_address(address: str, connected: str) -> None:
-    if address not in ("", "auto", "local", connected) and "://" not in address:
-        raise PolicyError(
-            f"RaySandbox(address={address!r}): this process is connected to the cluster at "
-            f"{connected}. Leave the address out, or call ray.shutdown() first"
-        )
 
 
 def job() -> str | None:

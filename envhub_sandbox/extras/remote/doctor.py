@@ -71,16 +71,12 @@ def _quotas(facts: ServerFacts) -> list[tuple[str, str, str]]:
     used: dict[str, Any] = facts.used
     return [
         (
-            _name(name),
+            safe_line(name.removesuffix("_bytes").replace("_", " ")),
             _amount(name, used.get(_USED[name], 0)) if name in _USED else "",
             _amount(name, limit),
         )
         for name, limit in facts.quotas.items()
     ]
-
-
-def _name(quota: str) -> str:
-    return safe_line(quota.removesuffix("_bytes").replace("_", " "))
 
 
 def _amount(quota: str, amount: Any) -> str:

@@ -227,7 +227,10 @@ def request_packages(
         if answer.state == "own":
             return None
         if answer.state == "made":
-            return PackageSet(_name(answer.name), _facts(answer.facts, order))
+            # Trust: only the server interprets the name.
+            if not 0 < len(answer.name) <= _NAME_CHARS or not answer.name.isalnum():
+                raise RemoteProtocolError("the server gives the packages an invalid name")
+            return PackageSet(answer.name, _facts(answer.facts, order))
         if answer.state != "making":
             raise RemoteProtocolError("the server reports an unknown state of packages")
         line = printable(answer.progress[:_MAX_CHARS], _MAX_CHARS)
@@ -238,13 +241,6 @@ def request_packages(
         time.sleep(_POLL_S if left is None else min(_POLL_S, left))
 
 
-def _name(name: str) -> str:
-    """Check the server's name for the packages. Trust: only the server interprets the name."""
-    if not 0 < len(name) <= _NAME_CHARS or not name.isalnum():
-        raise RemoteProtocolError("the server gives the packages an invalid name")
-    return name
-
-
 def _facts(facts: dict[str, object], order: m.NeedPackages) -> dict[str, Any]:
     """Return the facts for the provenance. Trust: input from the server; only types are checked."""
     lock, pins = (facts.get(name) for name in _FACTS)
@@ -252,19 +248,16 @@ def _facts(facts: dict[str, object], order: m.NeedPackages) -> dict[str, Any]:
         raise RemoteProtocolError("the server does not say which packages it has made")
     texts = [printable(str(pin)[:_MAX_CHARS], _MAX_CHARS) for pin in pins]
     kept = {"lock": printable(lock[:_MAX_CHARS], _MAX_CHARS), "packages": texts}
-    inferred = _inferred(facts.get("inferred"), order)
-    return {**kept, "inferred": inferred} if inferred else kept
-
-
-def _inferred(said: object, order: m.NeedPackages) -> list[dict[str, str]]:
-    """Return our guesses that the server has installed. Trust: input from the server."""
+    # Trust: input from the server.
+    said = facts.get("inferred")
     rows = said if isinstance(said, (list, tuple)) else ()
     modules = {str(row.get("module")) for row in rows[:_MAX_PINS] if isinstance(row, dict)}
-    return [
+    inferred = [
         {"module": module, "requirement": requirement, "where": where}
         for requirement, where, module, _ in cast("tuple[tuple[str, ...], ...]", order.guesses)
         if module in modules
     ]
+    return {**kept, "inferred": inferred} if inferred else kept
 
 
 @dataclass(eq=False)

@@ -213,7 +213,9 @@ class RemoteServer(WorkerServer):
         client: WorkerConnection | None = None
         every_s = _FIRST_S
         while not self._stop.wait(every_s):
-            self._read_ahead()
+            with contextlib.suppress(RuntimeError):  # another thread has just connected
+                for link in self.far.links:
+                    link.read_ahead()
             try:
                 if client is None:
                     client = self._connection()
@@ -225,21 +227,6 @@ class RemoteServer(WorkerServer):
                 _close(client)
                 client = None
         _close(client)
-
-    def _read_ahead(self) -> None:
-        with contextlib.suppress(RuntimeError):  # another thread has just connected
-            for link in self.far.links:
-                link.read_ahead()
-
-    def _close_jails(self) -> None:
-        """Close the jails that are still open there, when the process ends without closing them."""
-        if not self.far.held:
-            return
-        client, deadline = self._connection(), Deadline(_CLOSE_S)
-        with contextlib.suppress(EnvHubError), contextlib.closing(client):
-            client.hello(deadline)
-            for jail in tuple(self.far.held):
-                client.request(m.CloseJail(jail), deadline=deadline)
 
     def _connection(self) -> WorkerConnection:
         return WorkerConnection(self.endpoint, self.process_fd, far=self.far)
@@ -258,7 +245,13 @@ class RemoteServer(WorkerServer):
         """See ``WorkerServer``: close the open jails, and end the keep-alive thread."""
         if self._ended or not self._owner.is_here:
             return
-        self._close_jails()
+        # the jails that are still open there, when the process ends without closing them
+        if self.far.held:
+            client, deadline = self._connection(), Deadline(_CLOSE_S)
+            with contextlib.suppress(EnvHubError), contextlib.closing(client):
+                client.hello(deadline)
+                for jail in tuple(self.far.held):
+                    client.request(m.CloseJail(jail), deadline=deadline)
         self._stop.set()
         self._wake()
         self._thread.join(_STOP_S)

@@ -243,7 +243,14 @@ class _Git:
         self._until = time.monotonic() + self._timeout_s
         ours = {"GIT_CONFIG_NOSYSTEM": "1", "GIT_CONFIG_GLOBAL": os.devnull, "HOME": str(store)}
         theirs = os.environ if variables is None else variables
-        self._environment = {**_to_the_network(theirs), **ours, **_ALONE}
+        kept = own_variables() | {
+            name: value
+            for name, value in theirs.items()
+            if name in ("PATH", "LANG") or name.lower().endswith("_proxy")
+        }
+        if certificates := theirs.get("SSL_CERT_FILE"):
+            kept["GIT_SSL_CAINFO"] = os.path.abspath(os.path.expanduser(certificates))
+        self._environment = {**kept, **ours, **_ALONE}
 
     def fetch(self, source: str, commit: str, *options: str) -> None:
         """Fetch one commit into the folder, which becomes a repository."""
@@ -313,17 +320,6 @@ def _limited() -> tuple[str, ...]:
         memory = str(_MEMORY_KIB) if IS_LINUX else "unlimited"  # macOS knows no such limit
         words = "/bin/sh", "-c", _LIMITED, "sh", str(file_bytes // 512), memory
     return words
-
-
-def _to_the_network(variables: Variables) -> dict[str, str]:
-    kept = own_variables() | {
-        name: value
-        for name, value in variables.items()
-        if name in ("PATH", "LANG") or name.lower().endswith("_proxy")
-    }
-    if certificates := variables.get("SSL_CERT_FILE"):
-        kept["GIT_SSL_CAINFO"] = os.path.abspath(os.path.expanduser(certificates))
-    return kept
 
 
 _LOOKED_AT = 64 << 10

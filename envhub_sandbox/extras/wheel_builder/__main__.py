@@ -51,7 +51,11 @@ def main(folder: Path, ended: int) -> int:
 
 
 def _built(folder: Path, order: Mapping[str, Any]) -> dict[str, Any]:
-    tools = _tools(folder / "tools")
+    tools = folder / "tools"  # the interpreter's path
+    spec = importlib.util.find_spec("pyproject_hooks")
+    assert spec is not None
+    assert spec.origin is not None
+    shutil.copytree(Path(spec.origin).parent, tools / "pyproject_hooks")
     repository = _repository(folder, order)
     launcher = Launcher(repository, PROCESS, cache_root() / "snapshots")
     with EnvFactory([launcher], 1, 0, lambda manifest: None).make() as suites:
@@ -104,15 +108,6 @@ def _repository(folder: Path, order: Mapping[str, Any]) -> Repository:
         recipe=Recipe(make_env=_built, reference=snapshot.reference, config=None),
         installed=None,
     )
-
-
-def _tools(target: Path) -> Path:
-    """Copy ``pyproject_hooks`` into a folder for the path of an interpreter."""
-    spec = importlib.util.find_spec("pyproject_hooks")
-    assert spec is not None
-    assert spec.origin is not None
-    shutil.copytree(Path(spec.origin).parent, target / "pyproject_hooks")
-    return target
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,8 +24,6 @@ from envhub_worker.protocol.text import MARGIN, counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.extras.judge.changes import Change
-    from envhub_sandbox.extras.packages.locks.lockfile import TaskFingerprint
-    from envhub_sandbox.hub.snapshot import Snapshot
 
 
 @opt.with_options("env_kwargs", *opt.SOURCE)
@@ -62,11 +60,16 @@ def diff(
             read.append(static(make.snapshot(ref)))
         changes_found = changes.changes(read[0], read[1])
         if run:
+            from envhub_sandbox.extras.packages.locks import making
+            from envhub_sandbox.factory.make_env import make_env
+
             kwargs = make["env_kwargs"]
             tasks = []
             for repository in read:
                 bar.begin(f"loading {repository.reference} in a sandbox")
-                tasks.append(_tasks(repository.snapshot, kwargs, make.source))
+                reference = repository.snapshot.reference
+                with make_env(reference, env_kwargs=kwargs, **make.source) as suites:
+                    tasks.append(making.tasks_of(suites))
             changes_found += changes.environments(tasks[0], tasks[1])
     if json:
         print_json(changes.document(read[0], read[1], changes_found))
@@ -76,16 +79,6 @@ def diff(
         raise typer.Exit(Exit.DIFFERENT)
     if least and any(change.weighs(least) for change in changes_found):
         raise typer.Exit(Exit.ENVIRONMENT)
-
-
-def _tasks(
-    snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]
-) -> tuple[TaskFingerprint, ...]:
-    from envhub_sandbox.extras.packages.locks import making
-    from envhub_sandbox.factory.make_env import make_env
-
-    with make_env(snapshot.reference, env_kwargs=env_kwargs, **hub) as suites:
-        return making.tasks_of(suites)
 
 
 def _print(then: str, now: str, found: list[Change]) -> None:

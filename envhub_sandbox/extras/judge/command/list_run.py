@@ -108,7 +108,8 @@ def judge_list(
         words = f"[{number}/{len(entries)}] {result.verdict.value:<10} {entry.reference}"
         line = "; ".join([words, duration_text(result.seconds), *result.why])
         say(safe_line(line, 300), style=_COLOURS[result.verdict])
-    return worst_first(results)
+    worst_first = list(Verdict)
+    return sorted(results, key=lambda result: worst_first.index(result.verdict))
 
 
 def _entries(file: str) -> list[ListEntry]:
@@ -154,12 +155,6 @@ def judge_entry(
     failures = [] if report is None else failures_of(report)
     seconds = time.monotonic() - begun
     return Result(entry=entry, report=report, failures=failures, error=error, seconds=seconds)
-
-
-def worst_first(results: Iterable[Result]) -> list[Result]:
-    """Sorts results: failed, not judged, passed."""
-    order = list(Verdict)
-    return sorted(results, key=lambda result: order.index(result.verdict))
 
 
 def exit_code(results: Sequence[Result]) -> Exit:

@@ -219,7 +219,9 @@ class _Build:
         program = project.wheel_for(log)
         if program and program not in tried:
             return (program,)
-        old = _old_tools(self._interpreter)
+        # they bring pkg_resources; no setuptools before 66.1 runs in Python 3.12
+        is_old = tuple(map(int, self._interpreter.version.split(".")[:2])) < (3, 12)
+        old = ("setuptools<66" if is_old else "setuptools<81", "wheel<0.40")
         is_setuptools = self._project.backend.startswith("setuptools.")
         return old if is_setuptools and not project.advice(log) and old[0] not in tried else ()
 
@@ -283,12 +285,3 @@ class _Build:
             f"{log}",
             reason="resolution",
         )
-
-
-def _old_tools(interpreter: Interpreter) -> tuple[str, ...]:
-    """Returns requirements that build older projects and bring ``pkg_resources``.
-
-    No setuptools before 66.1 runs in Python 3.12.
-    """
-    old = tuple(map(int, interpreter.version.split(".")[:2])) < (3, 12)
-    return ("setuptools<66" if old else "setuptools<81", "wheel<0.40")

@@ -183,11 +183,6 @@ class _ForwardStream:
         self.at += len(data)
         return data
 
-    def skip_to(self, end: int) -> None:
-        """Skip the bytes before a position."""
-        while self.at < end:
-            self.take(min(AT_ONCE, end - self.at))
-
     def part(self, size: int, start: int) -> IO[bytes]:
         """Returns a stream of the next ``size`` bytes; valid until this stream moves on."""
         assert self.at == start, "members are read in their order"
@@ -240,7 +235,8 @@ def _of_tar(stream: _ForwardStream, title: str) -> Iterator[Member]:
             said, end = {}, start  # no data follows the header of a folder
         else:
             raise _no_file(title, said.get("path", header.name))
-        stream.skip_to(end)
+        while stream.at < end:
+            stream.take(min(AT_ONCE, end - stream.at))
 
 
 def _size_of(header: tarfile.TarInfo, said: dict[str, str], title: str) -> int:

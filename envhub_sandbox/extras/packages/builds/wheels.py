@@ -177,15 +177,12 @@ def _record(archive: zipfile.ZipFile, path: str) -> None:
     if names - digests.keys() - signatures or digests.keys() - names - signatures:
         raise not_as_expected("its RECORD lists other files than it has")
     for name in sorted(names - signatures):
-        if digests[name] != _digest(archive, name):
+        digest = hashlib.sha256()
+        with archive.open(name) as file:  # it reads no more bytes than the size in the directory
+            copy_bounded(file, None, archive.getinfo(name).file_size, digest)
+        encoded = base64.urlsafe_b64encode(digest.digest()).rstrip(b"=").decode()
+        if digests[name] != f"sha256={encoded}":
             raise not_as_expected(f"{name[:200]!r} is not the file that its RECORD says")
-
-
-def _digest(archive: zipfile.ZipFile, name: str) -> str:
-    digest = hashlib.sha256()
-    with archive.open(name) as file:  # it reads no more bytes than the size in the directory
-        copy_bounded(file, None, archive.getinfo(name).file_size, digest)
-    return "sha256=" + base64.urlsafe_b64encode(digest.digest()).rstrip(b"=").decode()
 
 
 FORMAT = 2

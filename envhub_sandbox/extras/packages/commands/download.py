@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import ProgressBar, out, print_json, safe_line, show
@@ -20,7 +20,16 @@ def download(make: opt.MakeOptions, *, upgrade: bool, as_json: bool) -> None:
         snapshot = make.snapshot_with_assets(make.ref)
         environment = _environment(snapshot, make, upgrade)
     if as_json:
-        print_json(_document(snapshot, environment))
+        installed = environment and {
+            "folder": str(environment.home),
+            "python": environment.python,
+            "version": environment.version,
+            "bytes": environment.size,
+            **environment.facts,
+        }
+        print_json(
+            {"reference": snapshot.reference, "commit": snapshot.commit, "environment": installed}
+        )
     else:
         _print(snapshot, environment)
 
@@ -36,17 +45,6 @@ def _environment(snapshot: Snapshot, make: opt.MakeOptions, upgrade: bool) -> En
     target = packages.ThisMachine(upgrade=upgrade)
     package_set = packages.packages_for(snapshot, chosen(dependencies, None)[0], target)
     return None if package_set is None else package_set.environment
-
-
-def _document(snapshot: Snapshot, environment: Environment | None) -> dict[str, Any]:
-    installed = environment and {
-        "folder": str(environment.home),
-        "python": environment.python,
-        "version": environment.version,
-        "bytes": environment.size,
-        **environment.facts,
-    }
-    return {"reference": snapshot.reference, "commit": snapshot.commit, "environment": installed}
 
 
 def _print(snapshot: Snapshot, environment: Environment | None) -> None:

@@ -108,7 +108,9 @@ def lock(
         choice = _choice(make["dependencies"], old)
         written = making.locked(snapshot, choice, upgrade=upgrade)
         if not no_spaces:
-            kwargs = _kwargs(make["env_kwargs"], old)
+            kwargs = make["env_kwargs"]
+            if not kwargs and old is not None and old.spaces is not None:
+                kwargs = opt.read_env_kwargs([old.spaces.arguments])
             written = _with_spaces(written, snapshot, kwargs, make.source)
         changes = [] if old is None else making.differences(old, written)
         lockfile.write(written, path)
@@ -127,14 +129,20 @@ def _verify(
     """``--check``: compare files, the index's files of each package, Python and spaces."""
     with ProgressBar(quiet=json) as bar:
         bar.begin(f"verifying {file}")
+        from envhub_sandbox.extras.packages import interpreters
         from envhub_sandbox.extras.packages.locks import lockfile, making
 
         locked = lockfile.read(file)
-        reference = _reference(ref, locked, file)
+        reference = ref or lockfile.reference_of(locked)
+        if reference is None:
+            raise UsageError(f"{file} locks a folder; name it: envhub lock --check {file} ./FOLDER")
         if ref is None:  # the reference is the lock's, which may be a stranger's
             make.snapshot(reference, public=True)
         snapshot = make.snapshot_with_assets(reference, locked.assets)
-        now = _now(locked, snapshot, no_index=no_index)
+        runner = lockfile.Runner.of(interpreters.find(locked.runner.python))
+        now = replace(making.with_files(locked, snapshot), runner=runner)
+        if not no_index:
+            now = replace(now, packages=making.relisted(locked).packages)
         if not (no_spaces or locked.spaces is None or making.differences(locked, now)):
             kwargs = opt.read_env_kwargs([locked.spaces.arguments])
             now = _with_spaces(locked, snapshot, kwargs, make.source)
@@ -213,13 +221,6 @@ def _choice(given: Any, old: LockFile | None) -> Choice:
     return chosen(given, None)[0]
 
 
-def _kwargs(given: dict[str, Any], old: LockFile | None) -> dict[str, Any]:
-    """Returns the arguments of the old lock if the caller gives none."""
-    if given or old is None or old.spaces is None:
-        return given
-    return opt.read_env_kwargs([old.spaces.arguments])
-
-
 def _with_spaces(
     made: LockFile, snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]
 ) -> LockFile:
@@ -232,24 +233,6 @@ def _with_spaces(
         lockfile.write(replace(made, spaces=None), path)
         with make_env(snapshot.reference, env_kwargs=env_kwargs, lock=path, **hub) as suites:
             return making.with_spaces(made, env_kwargs, suites)
-
-
-def _reference(ref: str | None, locked: LockFile, file: Path) -> str:
-    from envhub_sandbox.extras.packages.locks import lockfile
-
-    reference = ref or lockfile.reference_of(locked)
-    if reference is None:
-        raise UsageError(f"{file} locks a folder; name it: envhub lock --check {file} ./FOLDER")
-    return reference
-
-
-def _now(locked: LockFile, snapshot: Snapshot, *, no_index: bool) -> LockFile:
-    from envhub_sandbox.extras.packages import interpreters
-    from envhub_sandbox.extras.packages.locks import lockfile, making
-
-    runner = lockfile.Runner.of(interpreters.find(locked.runner.python))
-    now = replace(making.with_files(locked, snapshot), runner=runner)
-    return now if no_index else replace(now, packages=making.relisted(locked).packages)
 
 
 def _print(

@@ -195,24 +195,22 @@ def _origin(given: Mapping[str, Any], name: str, version: str, where: str) -> Wh
     if not _is(wheel, _SHA256) or not _is(environment, _SHA256):
         raise LockError(f"{name} in {where} has no hashes of the built files")
     if vcs := table(given, "vcs"):
-        return WheelOrigin(_of_git(vcs, name, version, where), environment, wheel)
+        below = f"#subdirectory={vcs['subdirectory']}" if vcs.get("subdirectory") else ""
+        try:
+            requirement = Requirement(
+                f"{name} @ git+{vcs.get('url')}@{vcs.get('commit-id')}{below}"
+            )
+            found = of_git(requirement, where)
+        except InvalidRequirement:
+            found = None
+        if found is None or not _COMMIT.fullmatch(found.commit):
+            raise LockError(f"{name} in {where} has no full commit of a repository of git")
+        return WheelOrigin(replace(found, name=name, version=version, where=""), environment, wheel)
     sdist = table(given, "sdist")
     url, digest = sdist.get("url"), table(sdist, "hashes").get("sha256")
     if not _is(url, _URL) or not _is(digest, _SHA256):
         raise LockError(f"{name} in {where} has no source with a URL and a SHA-256")
     return WheelOrigin(Source(name, version, url, digest), environment, wheel)
-
-
-def _of_git(vcs: Mapping[str, Any], name: str, version: str, where: str) -> Source:
-    below = f"#subdirectory={vcs['subdirectory']}" if vcs.get("subdirectory") else ""
-    try:
-        requirement = Requirement(f"{name} @ git+{vcs.get('url')}@{vcs.get('commit-id')}{below}")
-        found = of_git(requirement, where)
-    except InvalidRequirement:
-        found = None
-    if found is None or not _COMMIT.fullmatch(found.commit):
-        raise LockError(f"{name} in {where} has no full commit of a repository of git")
-    return replace(found, name=name, version=version, where="")
 
 
 def _origins(lock: Lock) -> dict[str, WheelOrigin]:

@@ -127,7 +127,19 @@ def resolve(
     """
     words = [*uv.NO_BUILDS, "--generate-hashes", *options, *(["--refresh"] if refresh else [])]
     text = _compiled(request, target, words, tell, timeout_s=timeout_s)
-    return Lock(_with_their_hashes(_pins(text), request.wanted), tuple(options))
+    pins: list[tuple[str, str, list[str]]] = []
+    for line in text.splitlines():
+        if pin := _PIN.fullmatch(line):
+            pins.append((pin[1], pin[2], []))
+        elif (hashed := _HASH.fullmatch(line)) and pins:
+            pins[-1][2].append(hashed[1])
+        else:
+            raise DependencyError(
+                f"uv returned {line[:200]!r}, which is not a pinned package with hashes: the index "
+                "must list the hashes of its packages",
+                reason="resolution",
+            )
+    return Lock(_with_their_hashes(pins, request.wanted), tuple(options))
 
 
 def _compiled(
@@ -293,23 +305,6 @@ def is_about_python(error: DependencyError) -> bool:
 def without_wheels(error: DependencyError) -> list[str]:
     """Returns packages without a wheel in uv's text; none if the text asks for another Python."""
     return [] if _NEEDS_PYTHON.search(str(error)) else _NO_WHEELS.findall(str(error))
-
-
-def _pins(text: str) -> list[tuple[str, str, list[str]]]:
-    """Parses name, version and hashes of each package; refuses any other line."""
-    pins: list[tuple[str, str, list[str]]] = []
-    for line in text.splitlines():
-        if pin := _PIN.fullmatch(line):
-            pins.append((pin[1], pin[2], []))
-        elif (hashed := _HASH.fullmatch(line)) and pins:
-            pins[-1][2].append(hashed[1])
-        else:
-            raise DependencyError(
-                f"uv returned {line[:200]!r}, which is not a pinned package with hashes: the index "
-                "must list the hashes of its packages",
-                reason="resolution",
-            )
-    return pins
 
 
 def _with_their_hashes(

@@ -243,7 +243,11 @@ def _check_release(path: str) -> None:
 
 
 def _error(what: str, said: str) -> DependencyError:
-    text = _in_the_users_words(said)[-_SHOWN:]
+    # uv addresses the author of the requirements, but the user reads it
+    plain = re.sub(r"^warning: .* is missing an upload date.*\n", "", said, flags=re.MULTILINE)
+    plain = re.sub(r"\byour requirements are unsatisfiable", "nothing satisfies all of them", plain)
+    plain = re.sub(r"\b[Yy]ou require\b", "it is required that there be", plain)
+    text = re.sub(r"^hint: ", "  ", plain, flags=re.MULTILINE).strip()[-_SHOWN:]
     for pattern, reason, meaning in _MEANINGS:
         if re.search(pattern, said):
             host = option_name("dependencies", "host")
@@ -251,14 +255,6 @@ def _error(what: str, said: str) -> DependencyError:
             cure = f" {meaning}{offline * (meaning == _NO_INDEX)}." if meaning else ""
             return DependencyError(f"{what}.{cure}\n{text}", reason=reason)
     return DependencyError(f"{what}; uv says:\n{text}")
-
-
-def _in_the_users_words(said: str) -> str:
-    """Rewords uv's text: uv addresses the author of the requirements, but the user reads it."""
-    said = re.sub(r"^warning: .* is missing an upload date.*\n", "", said, flags=re.MULTILINE)
-    plain = re.sub(r"\byour requirements are unsatisfiable", "nothing satisfies all of them", said)
-    plain = re.sub(r"\b[Yy]ou require\b", "it is required that there be", plain)
-    return re.sub(r"^hint: ", "  ", plain, flags=re.MULTILINE).strip()
 
 
 @contextlib.contextmanager
