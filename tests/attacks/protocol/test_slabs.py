@@ -305,10 +305,11 @@ class Mirror(tuple):
         (msgpack.packb([0.5, True, "run"]), "other scalars"),
         (msgpack.packb([0.5, 3, ["run"]]), "other scalars"),
         (b"\x91" * 5000, "."),
+        ((b"\xdc\x13\x00" * 1000).ljust(5000, b"\x01"), "exceeds max_array_len"),
         (b"\x80\x04.", "."),
         (b"", "."),
     ],
-    ids=["control", "few", "bool", "list", "deep", "pickle", "none"],
+    ids=["control", "few", "bool", "list", "deep", "claims", "pickle", "none"],
 )
 def test_columns_of_a_step_are_numbers_and_texts_of_its_form(
     asked: Asked, scalars: bytes, refusal: str

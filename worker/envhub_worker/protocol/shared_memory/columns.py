@@ -176,7 +176,8 @@ class StepColumns:
         if not self._scalars and not packed:
             return [make(scalars, taken) for _, make in self._fields]
         with UNTRUSTED:
-            read = msgpack.unpackb(packed, strict_map_key=False)
+            # A list that claims more elements, each list in it again, would take memory for them.
+            read = msgpack.unpackb(packed, max_array_len=len(self._scalars), max_map_len=0)
             # The worker fills in values; how many there are and of which classes is known already.
             if type(read) is not list or list(map(type, read)) != self._scalars:
                 raise RemoteProtocolError("the worker wrote other scalars than it had announced")
