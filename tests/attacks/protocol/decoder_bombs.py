@@ -105,6 +105,13 @@ REFUSED: dict[str, Callable[[], Frames]] = {
     "empty array of absurd shape": lambda: message(
         extension(1, b"\x0a\x03" + struct.pack("<QQQ", 2**62, 0, 2**62))
     ),
+    "empty array of many rows": lambda: message(
+        extension(1, b"\x0a\x02" + struct.pack("<QQ", 2**40, 0))
+    ),
+    "empty object array of many rows": lambda: packed([ext(21, struct.pack("<QQ", 2**40, 0))]),
+    "empty arrays of many rows together": lambda: many(
+        extension(1, b"\x0a\x02" + struct.pack("<QQ", 1000, 0)), 300
+    ),
     "frames": lambda: [*message(b"\xc0"), *[b""] * 100_000],
     "same key": lambda: message(map32(ITEMS // 2, b"\xa1a\xc0" * (ITEMS // 2))),
     "colliding integers": colliding_integers,

@@ -25,7 +25,8 @@ class WireLimits:
         depth: Nesting of containers. Code that walks a decoded value recurses; Python's own
             limit is 1000 frames.
         items: Elements of all containers together, a map's key and value counting as two.
-            An empty map takes one byte on the wire and about 70 in memory.
+            An empty map takes one byte on the wire and about 70 in memory. Also rows of all
+            arrays without elements, which take no bytes at all.
         text_bytes: One string in UTF-8. One wide character makes Python store four bytes each.
         int_bytes: One integer beyond 64 bit. Printing one takes quadratic time.
         hashed_keys: Keys of large maps, and elements of large sets, that are not text. Python

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
+from itertools import accumulate
+from operator import mul
 from typing import TYPE_CHECKING, Any
 
 import msgpack  # type: ignore[import-untyped]
@@ -68,7 +70,8 @@ class Decoder:
     """
 
     __slots__ = (
-        *("_arrays", "_borrows", "_buffers", "_hashed_keys", "_heads", "_make", "_tail"),
+        *("_arrays", "_borrows", "_buffers", "_empty_rows", "_hashed_keys", "_heads", "_make"),
+        "_tail",
         *("limits", "notes", "tensors", "things", "unpickler"),
     )
 
@@ -88,7 +91,8 @@ class Decoder:
         self.unpickler, self.tensors, self.things = unpickler, tensors, things
         self._arrays: ArrayReader | None = None  # made for the first array of the message
         self._make: Callable[[int, object], object] | None = None
-        self._heads = self._hashed_keys = 0  # heads without their array yet; keys so far
+        self._heads = 0  # without their array yet
+        self._hashed_keys = self._empty_rows = 0  # so far
         self.notes: list[tuple[Array, bytes]] | None = None
 
     def value(self, document: bytes) -> object:
@@ -163,6 +167,8 @@ class Decoder:
             reader = ArrayReader(self._tail, self._buffers, self.limits, borrows=self._borrows)
             self._arrays = reader
         array = self._arrays.take(descriptor)
+        if not array.size:
+            self.count_rows(array.shape)
         if self.notes is not None:
             self.notes.append((array, descriptor))
         return array
@@ -174,6 +180,16 @@ class Decoder:
         if self._make is None:
             self._make = self.things(self.limits)
         return self._make(head.code, _owned(items[0]) if self._borrows else items[0])
+
+    def count_rows(self, shape: tuple[int, ...]) -> None:
+        """Bound the rows of arrays without elements, which take no bytes: ``tolist`` makes a list
+        of each, and a loop has a turn for each.
+        """
+        self._empty_rows += sum(accumulate(shape[: shape.index(0)], mul))
+        if self._empty_rows > self.limits.items:
+            raise MessageTooLargeError(
+                f"Arrays without elements have more than {self.limits.items} rows (items)."
+            )
 
     def check_keys(self, keys: list[Any]) -> None:
         """Refuses keys chosen to collide, which would make a dict or set take quadratic time."""
@@ -307,7 +323,10 @@ def _build_slice(decoder: Decoder, head: _Head, items: list[Any]) -> object:
 def _build_of_numpy(decoder: Decoder, head: _Head, items: list[Any]) -> object:
     from envhub_worker.protocol.codec import arrays
 
-    return arrays.BUILDERS[head.code](head.payload, items, decoder.tensors)
+    value: Any = arrays.BUILDERS[head.code](head.payload, items, decoder.tensors)
+    if head.code == wire.OBJECTS and not value.size:
+        decoder.count_rows(value.shape)
+    return value
 
 
 def _build_enum(decoder: Decoder, head: _Head, items: list[Any]) -> object:
