@@ -226,7 +226,7 @@ class Builder:
 
     def take_apart(self, lane: Lane, shards: Sequence[int], deadline: Deadline) -> None:
         """Have the runners return infos apart, as ``Results.apart`` says."""
-        message = m.TakeApart(lane.number)
+        message = m.TakeApart(lane.number, self._results.single)
         requests: list[tuple[int, m.Message]] = [(lane.runners[shard], message) for shard in shards]
         for reply in lane.jail.exchange("make_env", requests, deadline):
             typed_reply(reply, m.Value)

@@ -140,12 +140,16 @@ class EnvSession:
         """Whether ``take_apart`` can ask the processes now, or needs to ask none."""
         return self.lease.lane is None or self.lifecycle.state is State.READY
 
-    def take_apart(self, deadline: Deadline) -> bool:
-        """Have infos come apart, as ``Results.apart`` says; returns whether they do."""
+    def take_apart(self, deadline: Deadline, *, single: bool = False) -> bool:
+        """Have infos come apart, as ``Results.apart`` says; returns whether they do.
+        ``single``: also have nobody but the caller reset it, as ``Results.single`` says.
+        """
         with self.use.hold("make_env"):
-            if not self.lease.results.apart and self.may_take_apart:
+            results = self.lease.results
+            if (not results.apart or single > results.single) and self.may_take_apart:
+                results.single = results.single or single
                 self.lease.take_apart(deadline)
-            return self.lease.results.apart
+            return results.apart
 
     # --- recovery --------------------------------------------------------------------------------
 

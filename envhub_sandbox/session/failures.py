@@ -209,6 +209,7 @@ class Failures:
             "task": manifest.task,
             "num_envs": manifest.num_envs,
             "shards": len(results.bounds),
+            "single": results.single,
             "lane": None if lease.lane is None else lease.lane.name,
         }
         loaded = lease.loaded

@@ -25,8 +25,8 @@ class Crash:
         error: The error that the caller gets.
         load: The arguments of the repository's ``make_env``.
         options: The other arguments that differ from their defaults.
-        task: ``suite``, ``task``, ``num_envs``, ``shards``, ``lane``; None before ``make_env`` has
-            returned.
+        task: ``suite``, ``task``, ``num_envs``, ``shards``, ``single``, ``lane``; None before
+            ``make_env`` has returned.
     """
 
     error: WorkerDiedError | WorkerTimeoutError

@@ -34,6 +34,7 @@ class Results:
         slices: The same as ``bounds``, counted from the first of these sub-environments.
         apart: Whether infos are returned as each sub-environment returned them: ``own`` and
             ``joined`` read these.
+        single: Whether a single environment is shown, which the runner never resets by itself.
         restores: Whether members of the space lose their class on the wire, and get it back here.
         max_bytes: How much larger than their own the workers' infos may be when joined.
     """
@@ -41,7 +42,7 @@ class Results:
     def __init__(self, manifest: EnvManifest, bounds: Sequence[tuple[int, int]]) -> None:
         self.manifest = manifest
         self.bounds = list(bounds)
-        self.apart = False
+        self.apart = self.single = False
         self.max_bytes = DEFAULT_LIMITS.message_bytes
         self._space = manifest.single_observation_space
         self._declared = manifest.shardable

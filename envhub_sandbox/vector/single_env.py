@@ -42,10 +42,10 @@ class SingleEnv(gym.Env[Any, Any]):
     """The only sub-environment of ``vector``, as a ``gymnasium.Env``.
 
     A vector environment resets an ended sub-environment by itself; a ``gymnasium.Env`` does not. So
-    the observation of a step that ends an episode is always the last one of that episode, and
-    ``reset`` begins the next episode. In the mode ``SAME_STEP`` the vector environment has begun it
-    already: then ``reset`` without a seed or options returns that first observation and does not
-    reset again, so the number of resets is the number that the caller asked for.
+    the runner is told to leave that to ``reset``. A repository's own vector class in the mode
+    ``SAME_STEP`` has begun the next episode already: then ``reset`` without a seed or options
+    returns that first observation and does not reset again, so the number of resets is the number
+    that the caller asked for.
 
     Args:
         vector: With ``num_envs`` 1.
@@ -66,7 +66,9 @@ class SingleEnv(gym.Env[Any, Any]):
             )
         self._vector = vector
         self._close = close or vector.close
-        self._apart = vector._apart() if isinstance(vector, SandboxVectorEnv) else None
+        self._apart = None
+        if isinstance(vector, SandboxVectorEnv):
+            self._apart = vector._apart(single=True)
         # The next episode, which has begun already.
         self._begun: tuple[Any, dict[str, Any]] | None = None  # what the next reset returns
         # the declared spaces, since the caller may set others

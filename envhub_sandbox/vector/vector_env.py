@@ -14,9 +14,8 @@ from functools import partial
 from threading import get_ident
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 
 from envhub_sandbox.errors import EnvHubError, RemoteEnvError
 from envhub_sandbox.session.requests import SENT, MessageFor, for_every_shard
@@ -524,15 +523,19 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         recipe = self._session.repository.recipe
         return recipe.spec(self._manifest.suite, self._manifest.task, facts)
 
-    def _apart(self) -> VectorApart | None:
+    def _apart(self, *, single: bool = False) -> VectorApart | None:
         """Have infos come apart from now on, for libraries of single environments. Returns None if
         a repository's own class joins them, or if the worker cannot be asked now.
+        ``single``: also have nobody but the caller reset it, as the autoreset mode then says.
         """
         if not self._manifest.shardable:
             return None
-        if not self._session.take_apart(Deadline(self._timeouts.call_s)):
+        if not self._session.take_apart(Deadline(self._timeouts.call_s), single=single):
             return None
         results = self._requests.results
+        if results.single:
+            self.autoreset_mode = AutoresetMode.DISABLED
+            self.metadata["autoreset_mode"] = AutoresetMode.DISABLED
         return VectorApart(self._reset, self._step, self._step_wait, results.own, results.each)
 
 
@@ -576,12 +579,10 @@ def metadata_of(manifest: EnvManifest, *, whole: bool = False) -> dict[str, Any]
     rate = metadata.get("render_fps")
     if rate is not None and (whole or rate == int(rate)):
         metadata["render_fps"] = max(1, round(rate))
-    mode: Any = manifest.autoreset_mode
+    mode = manifest.autoreset_mode
     if mode is None:
         return metadata
-    if hasattr(gym.vector, "AutoresetMode"):
-        mode = gym.vector.AutoresetMode(mode)
-    return {**metadata, "autoreset_mode": mode}
+    return {**metadata, "autoreset_mode": AutoresetMode(mode)}
 
 
 def _check_name(name: object) -> None:

@@ -12,6 +12,7 @@ import pytest
 from envhub_sandbox import errors, make_env
 from envhub_sandbox.extras.crash import bundle_writer
 from envhub_sandbox.extras.crash.bundle_reader import load_bundle
+from envhub_sandbox.vector.single_env import SingleEnv
 from tests.support.command_line import document, envhub
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository
@@ -50,7 +51,8 @@ def play(env: Any, steps: int = 2000) -> errors.WorkerDiedError:
 def test_a_replay_dies_at_the_same_step(
     tmp_path: Path, lane: str, n_envs: int, shards: int, sandbox: Any
 ) -> None:
-    """Over both lanes and in a fleet, with autoresets, masks, calls and attributes on the way."""
+    """Over both lanes and in a fleet, with autoresets, masks, calls and attributes on the way; a
+    single environment is not reset where the replayed one was not."""
     place = {
         "use_async_envs": True,
         "num_workers": shards,
@@ -65,7 +67,7 @@ def test_a_replay_dies_at_the_same_step(
         env.call("borrow", 2.5)
         mask = np.arange(n_envs) == n_envs - 1
         env.reset(options={"reset_mask": mask, "toll": 1.5})
-        error = play(env)
+        error = play(SingleEnv(env) if n_envs == 1 else env)
     assert f"envhub replay {error.bundle}" in str(error)
     found = document("replay", "--grant", str(error.bundle))
     assert (found["verdict"], found["changed_files"]) == ("same", [])

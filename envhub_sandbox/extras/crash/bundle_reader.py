@@ -54,8 +54,8 @@ class Bundle:
         death: ``reason``, ``exit_code``, ``signal``, ``request``, ``message``.
         load: The arguments of the repository's ``make_env``.
         arguments: The other arguments that differed from the default ones.
-        task: ``suite``, ``task``, ``num_envs``, ``shards``, ``lane``; None before ``make_env``
-            had returned.
+        task: ``suite``, ``task``, ``num_envs``, ``shards``, ``single``, ``lane``; None before
+            ``make_env`` had returned.
         count, steps: How many requests there are, and how many of them are steps.
     """
 
@@ -144,6 +144,7 @@ def _task(task: Any) -> dict[str, Any]:
         "task": task["task"],
         "num_envs": _member(task, "num_envs", int),
         "shards": _member(task, "shards", int),
+        "single": task.get("single") is True,
         "lane": "frames" if task.get("lane") == "frames" else "auto",
     }
 

@@ -114,6 +114,8 @@ def _made(
             f"make_env gives no {safe_line(f'{suite} / {task}')} of {bundle.task['num_envs']} "
             "sub-environments any more, so nothing can be repeated"
         )
+    if bundle.task["single"]:
+        env._apart(single=True)
     return env
 
 

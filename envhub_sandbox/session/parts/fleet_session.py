@@ -115,7 +115,7 @@ class FleetSession:
         whole = self.counters.snapshot()
         return {**whole, "state": self.lifecycle.state.name, "workers": workers}
 
-    def take_apart(self, deadline: Deadline) -> bool:
+    def take_apart(self, deadline: Deadline, *, single: bool = False) -> bool:
         """Have infos come apart, in all parts or in none; returns whether they do."""
         results = self.requests.results
         if not results.apart and all(part.may_take_apart for part in self.parts):

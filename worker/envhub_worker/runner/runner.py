@@ -297,7 +297,8 @@ class Runner:
 
     def take_apart(self, request: m.TakeApart) -> m.Message:
         """Send each sub-environment's own infos from now on."""
-        self._envs[request.env].apart = True
+        env = self._envs[request.env]
+        env.apart, env.single = True, request.single
         return m.Value(None)
 
     def call(self, request: m.Call) -> m.Message:

@@ -171,6 +171,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         sliced: Whether other processes hold the rest of the vector environment.
         apart: Whether each sub-environment's own infos are sent as they are, also if no other
             process holds a slice.
+        single: Whether only the caller resets it, whatever the autoreset mode.
         driven: The objects to reset, step and render: ``envs``, or a ``FreezingEnv`` for each.
         integers: Which discrete parts of the last observation are Python ints. Only kept for a
             single environment (``_single``).
@@ -200,7 +201,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self._sync = sync
         self._siblings = sync and self.num_envs > 1
         self.sliced = sliced
-        self.apart = False
+        self.apart = self.single = False
         self.integers: list[bool] = []
         self.shared: SharedState | None = None
         self.reward: tuple[Any, ...] = ()
@@ -253,7 +254,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self.batch.rewards[...] = 0.0
         self.batch.truncations[...] = True
         self._flagged = list(range(self.num_envs))
-        if self._mode == "SameStep":
+        if self._same_step:
             fresh = batches.members(
                 self.single_observation_space,
                 self.observation_space,
@@ -262,14 +263,14 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             )
             finals = [(i, {"final_obs": row, "final_info": {}}) for i, row in enumerate(fresh)]
             return sorted([*finals, *infos], key=itemgetter(0))
-        self._done = [True] * self.num_envs
+        self._done = [not self.single] * self.num_envs
         return infos
 
     def run_step(self, actions: Any) -> Pairs:
         """Step every sub-environment, or reset it if its episode is over; returns the infos.
         Each sub-environment gets its row of the batch of actions unchanged.
         """
-        batch, same_step, count = self.batch, self._mode == "SameStep", self.num_envs
+        batch, same_step, count = self.batch, self._same_step, self.num_envs
         store, rows, rewards = batch.store, batch.rows, batch.rewards
         dtype, shape = (None, None) if rows[0] is None else (rows[0].dtype, rows[0].shape)
         array = np.ndarray
@@ -308,7 +309,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                             observation, info = env.reset()
                             answered = index
                         else:
-                            done[index] = True
+                            done[index] = not self.single
                 if (
                     type(observation) is array
                     and observation.dtype is dtype
@@ -342,6 +343,10 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         if self.shared is not None:
             self.shared.look()
         return infos
+
+    @property
+    def _same_step(self) -> bool:
+        return self._mode == "SameStep" and not self.single
 
     @property
     def _single(self) -> bool:

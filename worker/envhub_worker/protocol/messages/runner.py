@@ -212,9 +212,14 @@ class ForgetEnds(Message, kind=85):
 
 
 class TakeApart(Message, kind=93):
-    """From now on send each sub-environment's own infos, not joined ones. Reply: ``Value``."""
+    """From now on send each sub-environment's own infos, not joined ones. Reply: ``Value``.
+
+    ``single``: the client shows the only sub-environment as a ``gymnasium.Env``, which nobody but
+    the caller resets.
+    """
 
     env: int
+    single: bool = False
 
 
 class LoadTask(Message, kind=86, asks="make_env", handed=("cfg", "env_kwargs")):
