@@ -128,80 +128,28 @@ def test_kernel_objects_cannot_be_made(jail: OpenJail, kind: str) -> None:
 
 # Harmless even for root: every argument is a descriptor or a pointer that leads nowhere, or a
 # number that the kernel has no meaning for.
-CALLS: dict[str, list[int]] = {
-    "acct": [1],
-    "add_key": [1, 1, 1, 1, 0],
-    "bpf": [0, 1, 72],
-    "capset": [1, 1],
-    "clone3": [1, 64],
-    "delete_module": [1, 0],
-    "epoll_pwait2": [-1, 1, 1, 0, 0, 0],
-    "execveat": [-1, 1, 0, 0, 0],
-    "fanotify_init": [-1, 0],
-    "finit_module": [-1, 1, 0],
-    "fsmount": [-1, 0, 0],
-    "fsopen": [1, 0],
-    "fspick": [-1, 1, 0],
-    "futex_waitv": [1, 0, 0, 0, 0],
-    "get_robust_list": [0x7FFFFFFF, 1, 1],
-    "init_module": [1, 4096, 1],
-    "io_uring_enter": [-1, 0, 0, 0, 0, 0],
-    "io_uring_register": [-1, 0, 0, 0],
-    "io_uring_setup": [1, 1],
-    "ioperm": [1 << 20, 1, 1],
-    "iopl": [99],
-    "ioprio_set": [99, 0, 0],
-    "kcmp": [1, 1, 99, 0, 0],
-    "kexec_file_load": [-1, -1, 0, 0, -1],
-    "kexec_load": [0, 1 << 20, 1, 0],
-    "keyctl": [9999, 0, 0, 0, 0],
-    "memfd_secret": [-1],
-    "migrate_pages": [0, 8, 1, 1],
-    "mknodat": [-1, 1, 0o100644, 0],
-    "mlockall": [99],
-    "modify_ldt": [0, 0, 0],
-    "mount": [1, 1, 1, 0, 0],
-    "mount_setattr": [-1, 1, 0, 1, 32],
-    "move_mount": [-1, 1, -1, 1, 0],
-    "move_pages": [0, 1, 1, 0, 1, 0],
-    "mseal": [1, 1, 1],
-    "name_to_handle_at": [-1, 1, 1, 1, 0],
-    "open_by_handle_at": [-1, 1, 0],
-    "open_tree": [-1, 1, -1],
-    "openat2": [-1, 1, 1, 24],
-    "perf_event_open": [1, 0, -1, -1, 0],
-    "pidfd_getfd": [-1, -1, 1],
-    "pivot_root": [1, 1],
-    "pkey_alloc": [1 << 20, 0],
-    "pkey_free": [999],
-    "prctl": [22, 2, 1, 0, 0],
-    "process_madvise": [-1, 1, 1, 0, -1],
-    "process_mrelease": [-1, -1],
-    "process_vm_readv": [1, 1, 0, 1, 0, -1],
-    "process_vm_writev": [1, 1, 0, 1, 0, -1],
-    "ptrace": [16, -1, 0, 0],
-    "quotactl": [-1, 1, 0, 1],
-    "readahead": [-1, 0, 1],
-    "reboot": [0, 0, 0, 0],
-    "request_key": [1, 1, 1, 0],
-    "rt_sigqueueinfo": [0x7FFFFFFF, 0, 1],
-    "seccomp": [1, 0, 1],
-    "setdomainname": [1, -1],
-    "sethostname": [1, -1],
-    "setns": [-1, 0],
-    "settimeofday": [1, 0],
-    "shmctl": [-1, 99, 0],
-    "signalfd4": [-1, 1, 8, 0],
-    "splice": [-1, 0, -1, 0, 1, 0],
-    "swapoff": [1],
-    "swapon": [1, 0],
-    "sync_file_range": [-1, 0, 0, 0],
-    "syslog": [99, 0, 0],
-    "tee": [-1, -1, 1, 0],
-    "umount2": [1, 0],
-    "unshare": [0x123],
-    "userfaultfd": [-1],
-    "utime": [1, 0],
+_CALLS = """
+acct 1; add_key 1 1 1 1 0; bpf 0 1 72; capset 1 1; clone3 1 64; delete_module 1 0;
+epoll_pwait2 -1 1 1 0 0 0; execveat -1 1 0 0 0; fanotify_init -1 0; finit_module -1 1 0;
+fsmount -1 0 0; fsopen 1 0; fspick -1 1 0; futex_waitv 1 0 0 0 0;
+get_robust_list 0x7FFFFFFF 1 1; init_module 1 4096 1; io_uring_enter -1 0 0 0 0 0;
+io_uring_register -1 0 0 0; io_uring_setup 1 1; ioperm 1048576 1 1; iopl 99; ioprio_set 99 0 0;
+kcmp 1 1 99 0 0; kexec_file_load -1 -1 0 0 -1; kexec_load 0 1048576 1 0; keyctl 9999 0 0 0 0;
+memfd_secret -1; migrate_pages 0 8 1 1; mknodat -1 1 0o100644 0; mlockall 99; modify_ldt 0 0 0;
+mount 1 1 1 0 0; mount_setattr -1 1 0 1 32; move_mount -1 1 -1 1 0; move_pages 0 1 1 0 1 0;
+mseal 1 1 1; name_to_handle_at -1 1 1 1 0; open_by_handle_at -1 1 0; open_tree -1 1 -1;
+openat2 -1 1 1 24; perf_event_open 1 0 -1 -1 0; pidfd_getfd -1 -1 1; pivot_root 1 1;
+pkey_alloc 1048576 0; pkey_free 999; prctl 22 2 1 0 0; process_madvise -1 1 1 0 -1;
+process_mrelease -1 -1; process_vm_readv 1 1 0 1 0 -1; process_vm_writev 1 1 0 1 0 -1;
+ptrace 16 -1 0 0; quotactl -1 1 0 1; readahead -1 0 1; reboot 0 0 0 0; request_key 1 1 1 0;
+rt_sigqueueinfo 0x7FFFFFFF 0 1; seccomp 1 0 1; setdomainname 1 -1; sethostname 1 -1; setns -1 0;
+settimeofday 1 0; shmctl -1 99 0; signalfd4 -1 1 8 0; splice -1 0 -1 0 1 0; swapoff 1;
+swapon 1 0; sync_file_range -1 0 0 0; syslog 99 0 0; tee -1 -1 1 0; umount2 1 0; unshare 0x123;
+userfaultfd -1; utime 1 0
+"""
+CALLS = {
+    name: [int(one, 0) for one in arguments]
+    for name, *arguments in map(str.split, _CALLS.split(";"))
 }
 UNREACHED = ("EPERM", "ENOSYS")
 WITHOUT_EFFECT = ("readahead", "sync_file_range", "utime")

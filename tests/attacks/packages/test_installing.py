@@ -78,18 +78,23 @@ def virtual_environment(folder: Path, wheels: list[Path]) -> Path:
 
 
 def what_starts_by_itself(folder: Path, traces: Path) -> Path:
-    """A wheel whose files an interpreter runs at its start."""
+    """A wheel whose files an interpreter runs at its start, and Gymnasium when it looks around."""
     files = {
         "trap_pth.py": trap(traces, "pth"),
         "trap.pth": "import trap_pth\n",
         "sitecustomize.py": trap(traces, "sitecustomize"),
         "usercustomize.py": trap(traces, "usercustomize"),
+        "trap_plugin.py": trap(traces, "plugin") + "def register(): pass\n",
+        "bait-1.0.dist-info/entry_points.txt": (
+            "[gymnasium.envs]\n__root__ = trap_plugin:register\n"
+        ),
     }
     return make_wheel(folder, "bait", "1.0", {**BAIT, **files})
 
 
 def test_what_an_interpreter_starts_with(real_index: Index, tmp_path: Path, traces: Path) -> None:
-    """``.pth``, ``sitecustomize``, ``usercustomize``: no interpreter outside of a jail has them."""
+    """``.pth``, ``sitecustomize``, ``usercustomize``, and plugins that are loaded early: no
+    interpreter outside of a jail has them."""
     wheel = what_starts_by_itself(real_index.folder, traces)
     python = virtual_environment(tmp_path / "control", [wheel])
     subprocess.run([str(python), "-c", "pass"], check=True)
@@ -97,27 +102,14 @@ def test_what_an_interpreter_starts_with(real_index: Index, tmp_path: Path, trac
     [site] = (tmp_path / "control").glob("lib/python3*/site-packages")
     subprocess.run([str(python), "-c", "pass"], check=True, env={"PYTHONPATH": str(site)})
     assert "sitecustomize" in sprung(traces)
+    load = "from importlib.metadata import entry_points as e\n[x.load() for x in e(group={!r})]"
+    subprocess.run([str(python), "-c", load.format("gymnasium.envs")], check=True)
+    assert "plugin" in sprung(traces)
     folder = write_repository(tmp_path / "repo", ENV, requirements__txt="bait==1.0\n")
     with make_env(folder) as suites:
         suites.env.reset(seed=0)
         assert suites.env.call("bait") == ("swallowed",)
         assert suites.env.call("sprung") == (["trap_pth"],)  # and there it may
-    assert sprung(traces) == set()
-
-
-def test_a_plugin_that_is_loaded_early(real_index: Index, tmp_path: Path, traces: Path) -> None:
-    files = {**BAIT, "trap_plugin.py": trap(traces, "plugin") + "def register(): pass\n"}
-    files["bait-2.0.dist-info/entry_points.txt"] = (
-        "[gymnasium.envs]\n__root__ = trap_plugin:register\n"
-    )
-    wheel = make_wheel(real_index.folder, "bait", "2.0", files)
-    python = virtual_environment(tmp_path / "control", [wheel])
-    load = "from importlib.metadata import entry_points as e\n[x.load() for x in e(group={!r})]"
-    subprocess.run([str(python), "-c", load.format("gymnasium.envs")], check=True)
-    assert sprung(traces) == {"plugin"}
-    folder = write_repository(tmp_path / "repo", ENV, requirements__txt="bait==2.0\n")
-    with make_env(folder) as suites:
-        suites.env.reset(seed=0)
     assert sprung(traces) == set()
 
 

@@ -29,15 +29,21 @@ def _is_at(env: Any, server: Listening) -> np.ndarray:
     return found
 
 
-def test_its_rows_come_back_elsewhere(rows: Path, stays: Listening, serve: Serve) -> None:
+def test_a_lost_server_costs_what_restart_says(rows: Path, stays: Listening, serve: Serve) -> None:
+    """Its rows come back elsewhere, in the next step or with the reset after an error that names
+    place and rows. Without restarts it stays dead; what to do is said, and nothing is left."""
     goes = serve("goes")
-    sandbox = [stays.sandbox(), goes.sandbox()]
-    options: dict[str, Any] = {"n_envs": 6, "num_workers": 4, "policy": {"restart": "transparent"}}
-    with started(rows, sandbox=sandbox, seed=7, **options) as env:
+
+    def made(restart: str, workers: int) -> Any:
+        sandbox, policy = [stays.sandbox(), goes.sandbox()], {"restart": restart}
+        return started(rows, 6, sandbox=sandbox, seed=7, num_workers=workers, policy=policy)
+
+    with made("transparent", 4) as env, made("on_reset", 2) as other, made("never", 2) as dead:
         env.set_attr("gain", [float(row) for row in range(6)])
         env.step(STILL)
         lost = _is_at(env, goes)
         assert lost.sum() == 3
+        expected = other.reset(seed=5)[0]
         goes.process.kill()
         observations, rewards, terminations, truncations, infos = env.step(STILL)
         assert truncations.tolist() == lost.tolist()
@@ -54,36 +60,21 @@ def test_its_rows_come_back_elsewhere(rows: Path, stays: Listening, serve: Serve
         assert rewards.tolist() == list(range(6)), "attributes were set again"
         numbers = env.sandbox.stats()
         assert (numbers["deaths"], numbers["restarts"]) == (2, 2)
-    assert eventually(lambda: stays.jails() == 0)
 
-
-def test_reset_has_them_elsewhere(rows: Path, stays: Listening, serve: Serve) -> None:
-    """``restart="on_reset"``: an error first, which names place and rows; then they are back."""
-    goes = serve("goes")
-    options: dict[str, Any] = {"n_envs": 6, "num_workers": 2, "policy": {"restart": "on_reset"}}
-    with started(rows, sandbox=[stays.sandbox(), goes.sandbox()], **options) as env:
-        expected = env.reset(seed=5)[0]
-        goes.process.kill()
         where = rf"\(sub-environments \d to \d of 6, on {goes.endpoint}\)"
         with pytest.raises(WorkerDiedError, match=where):
-            env.step(STILL)
+            other.step(STILL)
         with pytest.raises(WorkerDiedError, match=rf"call reset\(\) first {where}"):
-            env.step(STILL)
-        assert np.array_equal(env.reset(seed=5)[0], expected)
-        assert places(env) == [stays.endpoint] * 2
-        env.step(STILL)
+            other.step(STILL)
+        assert np.array_equal(other.reset(seed=5)[0], expected)
+        assert places(other) == [stays.endpoint] * 2
+        other.step(STILL)
 
-
-def test_without_restarts_it_stays_dead(rows: Path, stays: Listening, serve: Serve) -> None:
-    """The text names the rows, the place and what to do; close() is quick and leaves nothing."""
-    goes = serve("goes")
-    with started(rows, n_envs=6, sandbox=[stays.sandbox(), goes.sandbox()]) as env:
-        goes.process.kill()
         with pytest.raises(WorkerDiedError, match=rf"was lost .*on {goes.endpoint}"):
-            env.step(STILL)
+            dead.step(STILL)
         with pytest.raises(WorkerDiedError, match=r"make the environment again.*of 6, on tcp"):
-            env.reset()
-        assert inside.state(env).name == "DEAD"
+            dead.reset()
+        assert inside.state(dead).name == "DEAD"
     assert eventually(lambda: stays.jails() == 0)
 
 
@@ -122,17 +113,11 @@ def make_env(n_envs=1, use_async_envs=False):
 """
 
 
-def test_an_action_that_cannot_be_sent_is_sent_to_nobody(tmp_path: Path) -> None:
-    """It is named by the row that it is for, and all go on where they were."""
-    folder = write_repository(tmp_path / "texts", _TEXTS)
-    with started(folder, n_envs=2, sandbox=["process", "process"]) as env:
-        with pytest.raises(LocalProtocolError, match=r"actions\[1\]\[0\] cannot be sent"):
-            env.step((("a",), ("x" * (5 << 20),)))
-        assert env.step((("a",), ("b",)))[0].tolist() == [1, 1]
-
-
-def test_messages_of_no_layout_pack_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For its worker; a history of requests, which is off here, packs what it keeps."""
+def test_an_action_that_cannot_be_sent_is_sent_to_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is named by the row that it is for, and all go on where they were. What has no layout is
+    packed once, for its worker; a history of requests, which is off here, packs what it keeps."""
     folder = write_repository(tmp_path / "texts", _TEXTS)
     packed, pack = [], m.pack
 
@@ -142,6 +127,8 @@ def test_messages_of_no_layout_pack_once(tmp_path: Path, monkeypatch: pytest.Mon
 
     options: Any = {"sandbox": ["process", "process"], "policy": {"crash_history": 0}}
     with started(folder, n_envs=2, **options) as env:
+        with pytest.raises(LocalProtocolError, match=r"actions\[1\]\[0\] cannot be sent"):
+            env.step((("a",), ("x" * (5 << 20),)))
         monkeypatch.setattr(m, "pack", noting)
         assert env.step((("a",), ("b",)))[0].tolist() == [1, 1]
         assert env.step((("c",), ("d",)))[0].tolist() == [2, 2]

@@ -98,7 +98,6 @@ print(env.reset(options={{"token": 5.0, "delay": 0.0}})[0].tolist())
     ("name", "kind"),
     [
         ("zmq", "KeyboardInterrupt"),
-        ("zmq.sugar.frame", "KeyboardInterrupt"),
         ("envhub_sandbox.transport.lane", "KeyboardInterrupt"),
         ("envhub_sandbox.transport.lane", "ImportError"),
     ],

@@ -97,10 +97,17 @@ def test_the_tests_of_clients_pass(system: str) -> None:
 
 
 def test_it_lives_dies_and_starts_again(system: str, server: Listening, tmp_path: Path) -> None:
-    """Reset, step, call, set_attr, a death, a restart, and two closes."""
+    """Reset, step, call, set_attr, a death, a restart, and two closes. It leaves only its cache,
+    which lies where that system has it; in the temporary folder nothing is left."""
+    home, temporary = tmp_path / "home", tmp_path / "temporary"
+    temporary.mkdir()
+    folders = {"HOME": str(home), "TMPDIR": str(temporary), "ENVHUB_CACHE": ""}
     repository = write_repository(tmp_path / "repo", STILL + _DIES)
-    said = elsewhere(system, _LIFE, *words(server), repository)
+    said = elsewhere(system, _LIFE, *words(server), repository, **folders)
     assert said.split() == ["WorkerDiedError", system]
+    assert not list(temporary.iterdir())
+    cache = {"darwin": "Library/Caches/envhub-sandbox", "win32": "AppData/Local/envhub-sandbox"}
+    assert {path.name for path in (home / cache[system]).rglob("env.py")} == {"env.py"}
 
 
 def test_ctrl_c_interrupts_a_step(system: str, server: Listening, tmp_path: Path) -> None:
@@ -141,20 +148,22 @@ def test_ctrl_c_ends_a_command(system: str, server: Listening, tmp_path: Path) -
 _COMMANDS = """
 import json, sys
 from envhub_sandbox.cli import main
-for sys.argv[1:] in json.loads(sys.argv[1]):
+code, several = int(sys.argv[1]), json.loads(sys.argv[2])
+for sys.argv[1:] in several:
     try:
         main()
     except SystemExit as ended:
-        assert not ended.code, (sys.argv, ended.code)
+        assert (ended.code or 0) == code, (sys.argv, ended.code)
 """
 
 
 def commands(
-    system: str, *several: tuple[str | Path, ...], **variables: str
+    system: str, *several: tuple[str | Path, ...], code: int = 0, **variables: str
 ) -> subprocess.CompletedProcess[str]:
-    """Run commands that succeed one after the other, in one process: each import takes seconds."""
+    """Run commands that end with this code one after the other, in one process: each import takes
+    seconds."""
     words = json.dumps([[str(word) for word in one] for one in several])
-    return ran(system, "-c", _COMMANDS, words, **variables)
+    return ran(system, "-c", _COMMANDS, str(code), words, **variables)
 
 
 def test_commands_work(system: str, server: Listening, tmp_path: Path) -> None:
@@ -162,8 +171,10 @@ def test_commands_work(system: str, server: Listening, tmp_path: Path) -> None:
     with_keys = variables(server) | {"ENVHUB_CACHE": str(tmp_path / "cache")}
     where = ("--sandbox", server.endpoint)
     reports = ("--html", tmp_path / "page.html", "--junit", tmp_path / "junit.xml")
+    helped = ("", "run", "check", "doctor", "cache list", "image build")
     done = commands(
         system,
+        *((*words.split(), "--help") for words in helped),
         ("run", sample("cartpole"), "--episodes", "1", *where),
         ("inspect", sample("cartpole"), *where),
         ("check", sample("cartpole"), *where, *reports),
@@ -172,6 +183,7 @@ def test_commands_work(system: str, server: Listening, tmp_path: Path) -> None:
         ("cache", "remove", "--all"),
         **with_keys,
     )
+    assert done.stdout.count("Usage:") == len(helped)
     for text in ("confined by  strict", "Discrete(2)", "it knows our key"):
         assert text in done.stdout
     for text in ("passed", "\n1 snapshot", "Removed 1 snapshot"):
@@ -183,37 +195,16 @@ def test_commands_work(system: str, server: Listening, tmp_path: Path) -> None:
 _ENVHUB = ("-m", "envhub_sandbox")
 
 
-def test_the_default_says_what_there_is_instead(system: str) -> None:
-    """Before anything is downloaded; both other ways are named, by a command's options, too."""
+def test_the_default_says_what_there_is_instead(system: str, tmp_path: Path) -> None:
+    """Before anything is downloaded; both other ways are named, by a command's options, too. No
+    engine answers here: ``doctor`` says so, and how to get one that runs on such a system."""
     name = {"darwin": "macOS", "win32": "Windows"}[system]
-    done = ran(system, *_ENVHUB, "run", "nobody/nothing", code=Exit.SANDBOX)
+    asked = ("run", "nobody/nothing"), ("lock", sample("cartpole")), ("doctor",)
+    nowhere = {"PATH": str(tmp_path), "DOCKER_HOST": ""}
+    done = commands(system, *asked, code=Exit.SANDBOX, **nowhere)
     for text in (f"this is {name}", "--sandbox docker", "--sandbox tcp://HOST:PORT"):
         assert text in done.stderr
-    locked = ran(system, *_ENVHUB, "lock", sample("cartpole"), code=Exit.SANDBOX)
-    assert "run this on a Linux machine" in locked.stderr
-
-
-def test_doctor_says_what_there_is(system: str, tmp_path: Path) -> None:
-    """No engine answers here: it says so, and how to get one that runs on such a system."""
-    done = ran(system, *_ENVHUB, "doctor", code=Exit.SANDBOX, PATH=str(tmp_path), DOCKER_HOST="")
+    assert "run this on a Linux machine" in done.stderr
     assert "there is no --sandbox process" in done.stdout
     assert "there is no docker on PATH; install Docker Desktop" in done.stdout
     assert "envhub doctor tcp://HOST:PORT" in done.stdout
-
-
-def test_help_is_there(system: str) -> None:
-    asked = ("", "run", "check", "doctor", "cache list", "image build")
-    done = commands(system, *((*words.split(), "--help") for words in asked))
-    assert done.stdout.count("Usage:") == len(asked)
-
-
-def test_a_client_leaves_only_its_cache(system: str, server: Listening, tmp_path: Path) -> None:
-    """Which lies where that system has it; in the temporary folder nothing is left."""
-    home, temporary = tmp_path / "home", tmp_path / "temporary"
-    temporary.mkdir()
-    folders = {"HOME": str(home), "TMPDIR": str(temporary), "ENVHUB_CACHE": ""}
-    repository = write_repository(tmp_path / "repo", STILL + _DIES)
-    elsewhere(system, _LIFE, *words(server), repository, **folders)
-    assert not list(temporary.iterdir())
-    cache = {"darwin": "Library/Caches/envhub-sandbox", "win32": "AppData/Local/envhub-sandbox"}
-    assert {path.name for path in (home / cache[system]).rglob("env.py")} == {"env.py"}

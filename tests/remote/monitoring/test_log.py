@@ -57,44 +57,63 @@ def of(server: Listening, event: str, **fields: object) -> list[dict[str, Any]]:
     ]
 
 
-def test_the_life_of_two_clients_can_be_read(tmp_path: Path) -> None:
-    """Who came, what was opened for whom, what died of what, what was refused, and who left."""
-    names = {"alice": keys.generate(), "bob the builder": keys.generate()}
+def test_the_life_of_two_clients_can_be_read(
+    tmp_path: Path, wait_no_more: Callable[[], None]
+) -> None:
+    """Who came, what was opened for whom, what died of what, what was refused, and who left. That
+    a list of clients is broken is told once, and that it is read again. The end of the server, also
+    when its terminal is closed, is the end of its jails, its clients and its note."""
+    names = {"Zoë": keys.generate(), "bob the builder": keys.generate()}
     with logging_server(tmp_path, names, "--log-format", "json", "--max-jails", "1") as server:
-        alice, bob = (server.sandbox(client_key=key_text(one.secret)) for one in names.values())
-        with started(sample("counter"), n_envs=2, sandbox=alice) as env:
+        zoe, bob = (server.sandbox(client_key=key_text(one.secret)) for one in names.values())
+        listed = (tmp_path / "clients").read_text("utf-8")
+        replace(tmp_path / "clients", f"{listed}no key\n")
+        assert eventually(lambda: of(server, "clients_kept_as_they_were"))
+        with started(sample("counter"), n_envs=2, sandbox=zoe) as env:
             env.step(env.action_space.sample())
-            with pytest.raises(ServerBusyError), started(sample("mortal"), sandbox=alice):
+            with pytest.raises(ServerBusyError), started(sample("mortal"), sandbox=zoe):
                 pass
             with started(sample("mortal"), sandbox=bob) as others, pytest.raises(WorkerDiedError):
                 others.step([EXIT])
             with pytest.raises(PolicyError):
                 make_env(sample("mortal"), sandbox=bob, policy={"network": "host"})
-        assert eventually(lambda: of(server, "jail_closed", client="alice"))
-        found = events(server)
-    first, last = found[0], events(server)[-1]
+        assert eventually(lambda: of(server, "jail_closed", client="Zoë"))
+        replace(tmp_path / "clients", listed)
+        assert eventually(lambda: of(server, "clients_read", clients=2))
+        with started(sample("mortal"), sandbox=bob):
+            server.process.send_signal(_HANGS_UP)
+            assert server.process.wait(60) == 0
+            wait_no_more()
+    assert server.noted() == ""
+    found = events(server)
+    first, last = found[0], found[-1]
     assert (first["event"], last["event"]) == ("listening", "stopped")
     assert first["server_key"] == server.public
     assert all(one["level"] in LEVELS and one["time"].endswith("Z") for one in found)
     assert [one["time"] for one in found] == sorted(one["time"] for one in found)
     assert {one["client"] for one in of(server, "client_connected")} == set(names)
-    [opened] = of(server, "jail_opened", client="alice")
+    [opened] = of(server, "jail_opened", client="Zoë")
     assert opened["environment"].endswith("counter:env.py")
     assert re.fullmatch("[0-9a-f]{64}", opened["snapshot"])
     assert opened["profile"] == "strict"
     assert opened["seconds"] > 0
-    [closed] = of(server, "jail_closed", client="alice")
+    [closed] = of(server, "jail_closed", client="Zoë")
     assert (closed["jail"], closed["session"]) == (opened["jail"], opened["session"])
     assert closed["bytes_in"] > 0 < closed["bytes_out"]
-    [upload] = of(server, "upload", client="alice", snapshot=opened["snapshot"])
+    [upload] = of(server, "upload", client="Zoë", snapshot=opened["snapshot"])
     assert upload["bytes"] > 0
-    busy = of(server, "refused", client="alice", error="ServerBusyError")
+    busy = of(server, "refused", client="Zoë", error="ServerBusyError")
     assert {(one["quota"], one["used"], one["limit"]) for one in busy} == {("jails", 1, 1)}
     [died] = of(server, "jail_died", client="bob the builder")
     assert (died["reason"], died["level"]) == ("exit", "warning")
     assert died["environment"].endswith("mortal:env.py")
     [refused] = of(server, "refused", client="bob the builder")
     assert (refused["error"], "--allow-network" in refused["why"]) == ("PolicyError", True)
+    [wrong] = of(server, "clients_kept_as_they_were")
+    assert "line 3" in wrong["why"]
+    running = of(server, "jail_opened", client="bob the builder")[-1]
+    assert of(server, "jail_closed", jail=running["jail"], session=running["session"])
+    assert of(server, "client_left", session=running["session"], why="the server ends")
 
 
 def test_no_secret_is_in_a_log(tmp_path: Path) -> None:
@@ -108,42 +127,6 @@ def test_no_secret_is_in_a_log(tmp_path: Path) -> None:
     assert any(" jail_opened client=alice " in line for line in lines)
     own = (server.state / "server.key").read_text().strip()
     assert not any(key in server.said() for key in (secret, own))
-
-
-def test_the_end_of_a_server_is_the_end_of_what_it_has(
-    tmp_path: Path, wait_no_more: Callable[[], None]
-) -> None:
-    """Of its jails, its clients and its note; also when its terminal is closed."""
-    alice = keys.generate()
-    with logging_server(tmp_path, {"alice": alice}, "--log-format", "json") as server:
-        remote = server.sandbox(client_key=key_text(alice.secret))
-        with started(sample("mortal"), sandbox=remote):
-            server.process.send_signal(_HANGS_UP)
-            assert server.process.wait(60) == 0
-            wait_no_more()
-    assert server.noted() == ""
-    [opened], [closed] = of(server, "jail_opened"), of(server, "jail_closed")
-    assert closed["jail"] == opened["jail"]
-    [left] = of(server, "client_left")
-    assert (left["session"], left["why"]) == (opened["session"], "the server ends")
-    assert events(server)[-1]["event"] == "stopped"
-
-
-def test_a_broken_list_of_clients_is_told_once(tmp_path: Path) -> None:
-    """And that it is read again, with what its owner calls them."""
-    alice = keys.generate()
-    with logging_server(tmp_path, {"Zoë": alice}, "--log-format", "json") as server:
-        line = f"{key_text(alice.public)} Zoë\n"
-        replace(tmp_path / "clients", f"{line}no key\n")
-        assert eventually(lambda: of(server, "clients_kept_as_they_were"))
-        remote = server.sandbox(client_key=key_text(alice.secret))
-        with started(sample("mortal"), sandbox=remote):  # takes a while: seconds pass
-            pass
-        replace(tmp_path / "clients", line)
-        assert eventually(lambda: of(server, "clients_read", clients=1))
-    [wrong] = of(server, "clients_kept_as_they_were")
-    assert "line 2" in wrong["why"]
-    assert {one["client"] for one in of(server, "client_connected")} == {"Zoë"}
 
 
 def test_less_can_be_asked_for(tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from envhub_sandbox.extras.remote import repository as remote_repository
 from envhub_sandbox.sandboxes.pool import stop_idle
 from tests.compliance.conftest import pytest_generate_tests as pytest_generate_tests
 from tests.compliance.pair import Pair
-from tests.compliance.vector_env import Case, VectorEnvCompliance, cases, paired
+from tests.compliance.vector_env import Case, paired
+from tests.remote import test_parity
 from tests.remote.listening import counting
 from tests.remote.ray.clusters import node_of, only_server, servers
 from tests.support.command_line import below, gone
@@ -40,19 +41,12 @@ def pair(request: pytest.FixtureRequest, case: Case, cluster: Any) -> Iterator[P
 
 
 @pytest.mark.short
-class TestCounter(VectorEnvCompliance):
-    """Every kind of value in the infos, over two processes."""
-
-    sample = "counter"
-    cases = cases(use_async_envs=(True,), modes=("NextStep",))
-    steps = 60
+class TestCounter(test_parity.TestCounter):
+    """On a node, over two processes of it."""
 
 
-class TestLeRobotPendulum(VectorEnvCompliance):
-    """Dict observations and ``is_success`` in every info."""
-
-    sample = "lerobot_pendulum"
-    cases = cases(n_envs=(2,), use_async_envs=(False,), modes=("NextStep",))
+class TestLeRobotPendulum(test_parity.TestLeRobotPendulum):
+    """On a node."""
 
 
 @pytest.mark.short
