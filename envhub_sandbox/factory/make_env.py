@@ -238,7 +238,8 @@ def _plan(sandbox: str | Sandbox, options: Options) -> _Plan:
         if program and not (os.path.isfile(program) and os.access(program, os.X_OK)):
             raise PolicyError(
                 f"{option_name('python')} is {program!r}, which is not a program; it takes the "
-                "path of an interpreter, such as '.venv/bin/python'"
+                "path of an interpreter, such as '.venv/bin/python'; a version is chosen by "
+                f"{option_name('dependencies', {'python': '3.12'})}"
             )
         check_readable(policy.readable)
     return _Plan(chosen, policy, timeouts, source, runtime)

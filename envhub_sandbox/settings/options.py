@@ -80,7 +80,16 @@ class Option:
         """
         if self.check is not None:
             return self.check(value)
+        if self.kind is bool:
+            return self._flag(value)
         return value if self.least is None else self._whole(value)
+
+    def _flag(self, value: Any) -> bool:
+        import numpy as np  # late, so that a help does not wait for it
+
+        if not isinstance(value, (bool, np.bool_)):
+            raise TypeError(f"`{self.argument}` is {value!r}; it is True or False")
+        return bool(value)
 
     def _whole(self, value: Any) -> int | None:
         """A whole number of Python or numpy as an ``int``; None if that is the default."""
@@ -98,12 +107,13 @@ class Option:
         return count
 
 
-def _flag(value: Any) -> bool:
-    import numpy as np  # late, so that a help does not wait for it
+def _path(argument: str) -> Callable[[Any], Any]:
+    def checked(value: Any) -> Any:
+        if value is not None and not isinstance(value, (str, os.PathLike)):
+            raise TypeError(f"`{argument}` is {value!r}; it takes a path")
+        return value
 
-    if not isinstance(value, (bool, np.bool_)):
-        raise TypeError(f"`use_async_envs` is {value!r}; it is True or False")
-    return bool(value)
+    return checked
 
 
 def _assets(value: Any) -> tuple[str, ...]:
@@ -141,7 +151,6 @@ class Options:
         "--async",
         "Ask for use_async_envs=True: sub-environments may run in several processes.",
         kind=bool,
-        check=_flag,
     )
     env_kwargs: Mapping[str, Any] | None = _option(
         None,
@@ -157,6 +166,7 @@ class Options:
         "--python",
         "The interpreter that runs the repository; this one by default.",
         metavar="PATH",
+        check=_path("python"),
         sandboxed=True,
     )
     dependencies: str | os.PathLike[str] | Mapping[str, Any] = _option(
@@ -174,6 +184,7 @@ class Options:
         "--lock",
         "A file of 'envhub lock': use its packages; any difference is an error.",
         metavar="FILE",
+        check=_path("lock"),
         sandboxed=True,
     )
     assets: Sequence[str] = _option(
@@ -227,7 +238,12 @@ class Options:
         None, "--endpoint", "The Hub; $HF_ENDPOINT or huggingface.co.", metavar="URL", panel=_HUB
     )
     hub_cache_dir: str | Path | None = _option(
-        None, "--hub-cache-dir", "huggingface_hub's cache_dir.", metavar="PATH", panel=_HUB
+        None,
+        "--hub-cache-dir",
+        "huggingface_hub's cache_dir.",
+        metavar="PATH",
+        check=_path("hub_cache_dir"),
+        panel=_HUB,
     )
 
     allow_secrets: bool = _option(

@@ -226,7 +226,8 @@ def _from(cls: type[T], value: T | Mapping[str, Any] | None, argument: str) -> T
         return value
     if not isinstance(value, Mapping):
         raise PolicyError(
-            f"{argument} takes a {cls.__name__} or a mapping, not {type(value).__name__}"
+            f"{argument} is {value!r}; it takes a {cls.__name__}, or a mapping with keys such as "
+            f"{fields(cls)[0].name!r}"
         )
     names = [item.name for item in fields(cls)]
     unknown = [name for name in value if name not in names]
@@ -280,6 +281,14 @@ def _gpu(value: object) -> bool | tuple[int, ...]:
 
 
 _OPTIONAL_LIMITS = frozenset({"cpu_time_s", "file_bytes"})
+_LEAST_LIMITS = {
+    "memory_bytes": 1 << 20,
+    "open_files": 32,
+    "disk_bytes": 1 << 16,
+    "disk_files": 100,
+    "message_bytes": 1 << 16,
+}
+"""With less, no jail starts, or one cannot say why it does not."""
 
 
 def _texts(name: str, value: object) -> tuple[str, ...]:
@@ -311,8 +320,10 @@ def _whole(name: str, value: Any) -> Any:
             value = parse_size(value)
         except ValueError as error:
             raise PolicyError(f"{option_name(name)} is {value!r}; {error}") from None
-    if not (_is_number(value) and value > 0 and value // 1 == value):
-        raise PolicyError(f"{option_name(name)} is {value!r}; it takes a whole number above 0")
+    least = _LEAST_LIMITS.get(name, 1)
+    if not (_is_number(value) and value >= least and value // 1 == value):
+        takes = f"a whole number, {least} or more"
+        raise PolicyError(f"{option_name(name)} is {value!r}; it takes {takes}")
     return int(value)
 
 

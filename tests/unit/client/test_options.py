@@ -41,14 +41,21 @@ MIB = 1 << 20
         ({"n_envs": 0}, ValueError, "at least 1"),
         ({"n_envs": 100_000}, ValueError, "at most 65536"),
         ({"n_envs": 4.0}, TypeError, "whole number"),
-        ({"use_async_envs": "yes"}, TypeError, "True or False"),
+        *(
+            ({name: "no"}, TypeError, f"`{name}` is 'no'; it is True or False")
+            for name in ("use_async_envs", "trust_remote_code", "allow_secrets", "copy")
+        ),
+        *(
+            ({name: 3.12}, TypeError, f"`{name}` is 3.12; it takes a path")
+            for name in ("python", "lock", "hub_cache_dir")
+        ),
         ({"num_workers": 0}, ValueError, "at least 1"),
         ({"num_workers": 1.5}, TypeError, "whole number"),
         ({"env_kwargs": ["a"]}, TypeError, "mapping"),
         ({"env_kwargs": {1: 2}}, TypeError, "mapping"),
         ({"env_kwargs": {"n_envs": 3}}, TypeError, "separate argument"),
         ({"sandbox": False}, PolicyError, "sandbox is False"),
-        ({"python": "no-such-python"}, PolicyError, "not a program"),
+        ({"python": "3.12"}, PolicyError, r"not a program.* dependencies=\{'python': '3.12'\}"),
         ({"policy": {"lane": "fast"}}, PolicyError, "lane"),
         ({"lane": "frames"}, TypeError, r"policy=\{'lane': ...\}"),
         ({"server_key": "KEY"}, TypeError, "sandbox='tcp://HOST:PORT KEY'"),

@@ -72,14 +72,18 @@ def _limit(name: str, value: object, takes: str = "") -> Any:
         *(_limit("processes", value) for value in (-1, "4K")),
         *(_limit("open_files", value) for value in (True, 1.5)),
         _limit("disk_bytes", "1X", "; it takes a size"),
+        *(
+            _limit(name, least - 1, f"; it takes a whole number, {least} or more")
+            for name, least in {"message_bytes": 65536, "disk_files": 100, "open_files": 32}.items()
+        ),
         (lambda: Timeouts(step_s=0), "step_s is 0; it takes seconds above 0, or None"),
         (lambda: Timeouts(step_s=-1.0), "step_s is -1.0"),
         (lambda: Timeouts(step_s=True), "step_s is True"),
         (lambda: Timeouts(step_s="1"), "step_s is '1'"),
         (lambda: Timeouts(step_s=float("nan")), "step_s is nan"),
         (lambda: Timeouts(server_idle_s=-1), "server_idle_s is -1"),
-        (lambda: policy_from("strict", None), "policy takes a Policy or a mapping, not str"),
-        (lambda: timeouts_from(30), "timeouts takes a Timeouts or a mapping, not int"),
+        (lambda: policy_from("strict", None), "policy is 'strict'; it takes a Policy, or a map"),
+        (lambda: timeouts_from(30), "timeouts is 30; it takes a Timeouts, or a mapping"),
         (
             lambda: policy_from({"limits": {"processes": 5}}, Limits(processes=7)),
             "give one of them",  # an object says all of them: none can be meant to be dropped
