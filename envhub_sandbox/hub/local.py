@@ -17,7 +17,6 @@ import hashlib
 import os
 import posixpath
 import stat
-import warnings
 from collections.abc import Callable, Collection, Iterator
 from operator import attrgetter
 from pathlib import Path
@@ -45,6 +44,7 @@ from envhub_sandbox.hub.listing import (
 from envhub_sandbox.hub.secrets import is_home, looks_secret
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import extras
+from envhub_sandbox.system.log import warn_caller
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import counted, first_of
 
@@ -222,10 +222,9 @@ class LocalFolder:
             return
         if any(file.path == _REQUIREMENTS for file in listing.files):
             return
-        warnings.warn(
+        warn_caller(
             f"{self.root / self.entry} is named alone, so {beside} does not say which packages it "
             f"gets. Name the folder, {self.as_folder()}, or declare them in the file itself",
-            stacklevel=2,
         )
 
     def as_folder(self) -> str:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -50,7 +49,7 @@ from envhub_sandbox.hub.reference import (
 )
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import extras
-from envhub_sandbox.system.log import SNAPSHOT, tell
+from envhub_sandbox.system.log import SNAPSHOT, tell, warn_caller
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import first_of
 
@@ -100,10 +99,9 @@ def _warn_of_two_meanings(reference: str) -> None:
         return
     with contextlib.suppress(HubReferenceError):
         ref = HubRef.parse(reference)
-        warnings.warn(
+        warn_caller(
             f"{reference!r} is a folder here, and is taken as that. Write './{reference}' to say "
             f"so, or '{replace(ref, revision='main')}' for the repository of that name on the Hub",
-            stacklevel=2,
         )
 
 

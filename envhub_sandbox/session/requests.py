@@ -10,7 +10,6 @@ docs/internals/interruption.md gives the reasons; comments name its rules by num
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -33,8 +32,8 @@ from envhub_sandbox.session.prewarm import Prewarm
 from envhub_sandbox.session.recorder import Recorder
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.use_lock import FleetUse, UseLock
+from envhub_sandbox.system.log import warn_caller
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline, deadline_of
-from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results, StepResult, all_replies, is_of_joining
 from envhub_sandbox.transport.shard_trials import ENOUGH_STEPS
@@ -110,12 +109,11 @@ class RequestOrder(ABC):
         if self.stepping in (None, thread) or self._warned_of_two:
             return
         self._warned_of_two = True
-        warnings.warn(
+        warn_caller(
             f"{self._repository.label}: two threads step one environment at the same time. "
             "The second waits for the first, and each continues the other's episodes: give each "
             "thread an environment of its own, or hold a lock around reset and all its steps",
             RuntimeWarning,
-            stacklevel=level_of_the_caller(),
         )
 
     def refuse_if_busy(self, name: str) -> None:

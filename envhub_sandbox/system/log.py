@@ -1,4 +1,4 @@
-"""Reports on running work: our part of the ``logging`` tree, and progress lines.
+"""Reports on running work: our part of the ``logging`` tree, warnings, and progress lines.
 
 The loggers are silent until the application configures them. ``envhub_sandbox.worker``
 logs jails: opened, closed (DEBUG), died, timed out, restarted (INFO).
@@ -17,6 +17,7 @@ import contextlib
 import logging
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,18 @@ DEPENDENCIES = ROOT.getChild("dependencies")
 CRASHES = ROOT.getChild("crashes")
 ERRORS = ROOT.getChild("errors")
 MESSAGES = ROOT.getChild("messages")
+
+
+def warn_caller(message: str | Warning, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line of the caller's own code: the first frame outside of this package."""
+    frame, level = sys._getframe(), 1
+    while frame.f_back is not None and _is_ours(frame.f_globals.get("__name__")):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)
+
+
+def _is_ours(name: object) -> bool:
+    return isinstance(name, str) and name.partition(".")[0] == ROOT.name
 
 
 _WIDTH = 100

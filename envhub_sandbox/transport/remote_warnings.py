@@ -7,13 +7,12 @@ error of the worker.
 
 from __future__ import annotations
 
-import sys
-import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 
 from envhub_sandbox.errors import RemoteEnvWarning
 from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.log import warn_caller
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.messages.prefix import (
@@ -28,7 +27,6 @@ from envhub_worker.protocol.text import printable
 
 MOST = 100
 """The most different warnings that are shown of one repository."""
-_PACKAGE = __name__.partition(".")[0]
 _SHARED = (
     "sub-environments that share a process use {} of it, so they may give other results than with "
     "AsyncVectorEnv, where each has a process. From the next make_env of this commit on each has "
@@ -85,16 +83,4 @@ class RemoteWarnings:
                 return
             words = one_line(category, MAX_CATEGORY), printable(text, MAX_TEXT)
             warning = RemoteEnvWarning(label, *words)
-            warnings.warn(warning, stacklevel=level_of_the_caller())
-
-
-def level_of_the_caller() -> int:
-    """The ``stacklevel`` of the first frame outside of this package."""
-    frame, level = sys._getframe(1), 1
-    while frame.f_back is not None and _is_ours(frame.f_globals.get("__name__")):
-        frame, level = frame.f_back, level + 1
-    return level
-
-
-def _is_ours(name: object) -> bool:
-    return isinstance(name, str) and name.partition(".")[0] == _PACKAGE
+            warn_caller(warning)

@@ -19,9 +19,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from envhub_sandbox.errors import EnvHubError, RemoteEnvError
 from envhub_sandbox.session.requests import SENT, MessageFor, for_every_shard
+from envhub_sandbox.system.log import warn_caller
 from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Own, StepResult
 from envhub_sandbox.transport.values import not_here, seeds
@@ -111,12 +111,11 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         """Warn if the repository's vector environment has attributes that ours hide."""
         hidden = _OURS.intersection(self._manifest.attributes)
         if hidden:
-            warnings.warn(
+            warn_caller(
                 f"{self._session.repository.label}: its vector environment has attributes named "
                 f"{', '.join(sorted(hidden))}, which are not served: "
                 f"{self._requests.face} has its own",
                 UserWarning,
-                stacklevel=level_of_the_caller(),
             )
 
     @property

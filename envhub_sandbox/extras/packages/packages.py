@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
@@ -22,7 +21,7 @@ from envhub_sandbox.hub.reference import PYPI
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import log
-from envhub_sandbox.system.log import DEPENDENCIES
+from envhub_sandbox.system.log import DEPENDENCIES, warn_caller
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import size_text
 
@@ -117,11 +116,10 @@ def _warn_of_cuda(lock: Lock, interpreter: Interpreter) -> None:
             max((wheel.size or 0 for wheel in package.wheels), default=0) for package in packages
         )
     much = f" ({size_text(size)} of downloads)" if size else ""
-    warnings.warn(
+    warn_caller(
         f"PyTorch comes with CUDA{much}, and jails have no GPU here: the index has no build "
         "without. UV_TORCH_BACKEND=cpu in the environment takes PyTorch's own, by its index; "
         f"{option_name('policy', {'gpu': True})} gives jails a GPU",
-        stacklevel=2,
     )
 
 

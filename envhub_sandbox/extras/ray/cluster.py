@@ -12,7 +12,6 @@ import importlib.util
 import json
 import platform
 import threading
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -23,8 +22,7 @@ from envhub_sandbox.errors import (
     WorkerStartupError,
 )
 from envhub_sandbox.settings.options import option_name
-from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.transport.remote_warnings import level_of_the_caller
+from envhub_sandbox.system.log import WORKER, warn_caller
 from envhub_worker.protocol.text import printable
 
 _MOST_BYTES = 65_536
@@ -80,7 +78,7 @@ def connect(address: str = "") -> None:
         if is_local:
             cpus = ray.cluster_resources().get("CPU", 0)
             started = f"ray.init was not called: a local Ray with {cpus:g} CPUs was started"
-            warnings.warn(started, RuntimeWarning, stacklevel=level_of_the_caller())
+            warn_caller(started, RuntimeWarning)
 
 
 def _started_here(address: str) -> bool:

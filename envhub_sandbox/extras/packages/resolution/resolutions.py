@@ -10,7 +10,6 @@ import contextlib
 import hashlib
 import json
 import os
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -29,6 +28,7 @@ from envhub_sandbox.extras.packages.resolution import index, resolve
 from envhub_sandbox.extras.packages.resolution.resolve import WORKERS, Lock, Target
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import folders
+from envhub_sandbox.system.log import warn_caller
 
 if TYPE_CHECKING:
     from envhub_sandbox.extras.packages.modules import Guess
@@ -85,7 +85,7 @@ def resolution_for(
                 f"{guess.wanted.requirement} is installed, which nothing declares "
                 f"({guess.wanted.where}); {strict} takes what is declared alone"
             )
-            warnings.warn(text, stacklevel=2)
+            warn_caller(text)
     remember(key, resolution)
     return resolution
 
@@ -140,7 +140,7 @@ def _with_newest(
             [old] = [pin for pin in lock.packages if pin.startswith(f"{source.name}==")]
             older = option_name("dependencies", {"override": [old]})
             text = f"{old} is installed, the newest that has a wheel; {older} asks for it. {error}"
-            warnings.warn(text, stacklevel=2)
+            warn_caller(text)
     return lock
 
 

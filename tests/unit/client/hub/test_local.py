@@ -98,6 +98,7 @@ def test_a_folder_that_is_here_comes_before_the_hub(
     folder, _, path = text.rstrip("/").partition(":")
     assert snapshot.reference == f"{tmp_path / folder}:{path or 'env.py'}"
     told = [str(one.message) for one in caught]
+    assert all(one.filename == __file__ for one in caught), "the line of the caller"
     if folder == "org/repo" and not text.endswith("/"):
         assert told == [
             f"{text!r} is a folder here, and is taken as that. Write './{text}' to say so, or "
