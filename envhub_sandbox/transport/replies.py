@@ -34,6 +34,7 @@ from envhub_worker.protocol.text import continued, printable, quoted
 _WORD_CHARS = 100
 """The most characters of an operation, a signal, or a reason."""
 _PROFILE = 'profile "(strict|no-userns|container)"'
+_LIMIT = r"\((memory_bytes|disk_bytes|disk_files|cpu_time_s)\)"
 
 
 class UnreachableError(SandboxUnavailableError):
@@ -100,9 +101,10 @@ def typed_reply(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.
 # --- messages of servers -------------------------------------------------------------------------
 
 
-def _named(fix: str) -> str:
-    """The advice, with a profile written as the user sets it: as an argument or a CLI option."""
-    return re.sub(_PROFILE, lambda match: option_name("profile", match[1]), fix)
+def _named(text: str) -> str:
+    """The text, with a profile or a limit written as the user sets it: by argument or option."""
+    text = re.sub(_PROFILE, lambda match: option_name("profile", match[1]), text)
+    return re.sub(_LIMIT, lambda match: f"({option_name(match[1])})", text)
 
 
 def refusal(reply: m.Refusal) -> Exception:
@@ -147,7 +149,7 @@ def death(reply: m.Death) -> WorkerDiedError:
     reason: Any = one_line(reply.reason, _WORD_CHARS)
     signal = None if reply.signal is None else one_line(reply.signal, _WORD_CHARS)
     operation = one_line(reply.operation, _WORD_CHARS)
-    why = printable(reply.detail)
+    why = _named(printable(reply.detail))
     last = printable(reply.tail, len(reply.tail))  # as much as the policy's output_bytes
     how = _REASONS.get(reason, reason)
     if signal:

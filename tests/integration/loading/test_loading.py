@@ -296,7 +296,7 @@ class TestWhatGoesWrong:
     @pytest.mark.parametrize(
         ("env_py", "error", "text"),
         [
-            ("import gymnasium\n", LoadError, "make_env"),
+            ("make_envs = 3\n", LoadError, r"did you mean 'make_envs'\?"),
             ("make_env = 3\n", LoadError, "make_env is a"),
             ("def make_env(:\n", LoadError, "SyntaxError"),
             ("import no_such_package_x\n", DependencyError, "no_such_package_x"),

@@ -128,7 +128,11 @@ def import_entry(snapshot: str, entry: str, scratch: str) -> Callable[..., Any]:
     make_env = getattr(module, "make_env", None)
     if not callable(make_env):
         kind = f"{type(make_env).__module__}.{type(make_env).__qualname__}"
-        lacks = "it has no such name" if make_env is None else f"its make_env is a {kind}"
+        import difflib  # late: few need it
+
+        close = difflib.get_close_matches("make_env", vars(module), 1)
+        meant = f" (did you mean {close[0]!r}?)" if close else ""
+        lacks = f"it has no such name{meant}" if make_env is None else f"its make_env is a {kind}"
         raise EntryError(
             f"{entry} must expose `make_env(n_envs=int, use_async_envs=bool)`; {lacks}"
         )

@@ -193,6 +193,11 @@ class _Maker:
         if isinstance(env, gym.Env) or old_gym.is_env(env):
             _refuse_batched(env)
             return Task(suite, task, recording=self._multiplied(env, pick))
+        if isinstance(env, type):
+            raise ResultError(
+                f"make_env returned the class {env.__qualname__}; return an environment of it, as "
+                f"in `return {env.__qualname__}()`"
+            )
         lacks = [name for name in _DUCK if not hasattr(env, name)]
         if not {"reset", "step"} & {*lacks}:
             raise ResultError(

@@ -307,5 +307,6 @@ class Init:
         if signum is None:
             return "exit", ""
         if signum == signal.SIGXCPU:
-            return "cpu-limit", f"{self._jail.spec.confinement.limits.cpu_time_s} CPU seconds used"
+            limit = self._jail.spec.confinement.limits.cpu_time_s
+            return "cpu-limit", f"{limit} CPU seconds used (cpu_time_s)"
         return self._watchdog.killed_by_kernel() or ("signal", "")

@@ -208,6 +208,7 @@ def test_the_kinds_of_both_conversations_are_apart() -> None:
         (m.Death(1, "signal", None, "SIGKILL", "", "", ""), "died: a signal ended it (SIGKILL)"),
         (m.Death(1, "exit", 0, None, "", "bye", "reset"), "Its last output:\n  | bye"),
         (m.Death(1, "exit", 0, None, "why", "", "reset"), "\nwhy"),
+        (m.Death(1, "out-of-memory", 0, None, "(memory_bytes)", "", ""), "(limits: memory_bytes)"),
     ],
 )
 def test_deaths_say_how(reply: m.Death, text: str) -> None:

@@ -91,7 +91,12 @@ def test_results_become_tasks(returned: Any, names: list[tuple[str, Any]]) -> No
 @pytest.mark.parametrize(
     ("returned", "named"),
     [
-        *((None, "None"), ([1, 2], "list"), (Inner, "Inner"), ([many], "list")),
+        *(
+            (None, "None"),
+            ([1, 2], "list"),
+            (Inner, r"the class Inner; .*`return Inner\(\)`"),
+            ([many], "list"),
+        ),
         *(({}, "empty"), ({"a": {}}, "without an environment"), ({"a": {0: 42}}, "42")),
         *(({"a": None}, "None"), ({("a", "b"): {0: None}}, "tuple")),
     ],

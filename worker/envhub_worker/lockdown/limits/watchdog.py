@@ -270,8 +270,8 @@ class Watchdog:
         if self._events < 0 or cgroups.oom_kills(self._events) <= self._seen_kills:
             return None
         self._seen_kills = cgroups.oom_kills(self._events)
-        limit = self._limits.memory_bytes // MIB
-        return "out-of-memory", f"over {limit} MiB: the kernel ended one of its processes"
+        limit = f"{self._limits.memory_bytes // MIB} MiB (memory_bytes)"
+        return "out-of-memory", f"over {limit}: the kernel ended one of its processes"
 
     def _look_at_memory(self, pids: Collection[int]) -> tuple[Reason, str] | None:
         if self._events >= 0:
@@ -286,7 +286,8 @@ class Watchdog:
         self._memory_due = time.monotonic() + seconds_to_next_look(used, limit)
         if used <= limit:
             return None
-        return "out-of-memory", f"{used // MIB} MiB in use, {limit // MIB} MiB permitted"
+        permitted = f"{limit // MIB} MiB permitted (memory_bytes)"
+        return "out-of-memory", f"{used // MIB} MiB in use, {permitted}"
 
     def _look_at_disk(self, folder: str, pids: Collection[int]) -> tuple[Reason, str] | None:
         before = time.monotonic()
@@ -296,7 +297,7 @@ class Watchdog:
         self._disk_due = after + max(_DISK_LOOK_S, _DISK_SHARE * (after - before))
         if size > self._limits.disk_bytes:
             allowed = self._limits.disk_bytes // MIB
-            return "disk-limit", f"{size // MIB} MiB of files, {allowed} MiB permitted"
+            return "disk-limit", f"{size // MIB} MiB of files, {allowed} MiB permitted (disk_bytes)"
         if files > self._limits.disk_files:
-            return "disk-limit", f"over {self._limits.disk_files} files"
+            return "disk-limit", f"over {self._limits.disk_files} files (disk_files)"
         return None
