@@ -53,7 +53,7 @@ from envhub_worker.protocol.errors import MessageTooLargeError as MessageTooLarg
 from envhub_worker.protocol.errors import ProtocolError as ProtocolError
 from envhub_worker.protocol.errors import RemoteProtocolError as RemoteProtocolError
 from envhub_worker.protocol.errors import VersionMismatchError as VersionMismatchError
-from envhub_worker.protocol.text import continued
+from envhub_worker.protocol.text import continued, printable
 
 DependencyReason = Literal[
     "requirement", "resolution", "index", "integrity", "size", "interpreter", "module", "other"
@@ -112,6 +112,10 @@ class LockDriftError(LockError):
 
 class ActionError(EnvHubError, ValueError):
     """Actions of a wrong shape, dtype or structure. Nothing was sent; the env is still usable."""
+
+    def __init__(self, message: str) -> None:
+        # it quotes the space, of which Gymnasium prints a Text's characters as they are
+        super().__init__(printable(message))
 
 
 class ActionTypeError(ActionError, TypeError):

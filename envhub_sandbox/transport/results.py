@@ -183,7 +183,8 @@ class Results:
             for part, size in zip(parts, self._sizes, strict=True):
                 if not batches.conforms(self._space, part, size):
                     raise RemoteProtocolError(
-                        f"the worker sent an observation that is not a batch of {self._space}"
+                        "the worker sent an observation that is not a batch of "
+                        f"{one_line(str(self._space), _SHOWN)}"
                     )
         joined = parts[0] if len(parts) == 1 else batches.join(self._space, parts)
         if not (self.restores and batches.conforms(self._space, joined, self.count)):

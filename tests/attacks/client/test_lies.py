@@ -17,7 +17,14 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.errors import (
+    ActionError,
+    EnvHubError,
+    RemoteProtocolError,
+    WorkerError,
+    WorkerTimeoutError,
+)
+from envhub_sandbox.vector.actions import UniterableError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import encode_env
 from envhub_worker.protocol.spaces.spaces import encode_space
@@ -41,6 +48,7 @@ from tests.attacks.client.lying_server import (
     manifest,
     step_done,
 )
+from tests.attacks.output.painting import ESCAPES, paints
 from tests.support import inside
 from tests.support.repositories import CARTPOLES, write_repository
 from tests.support.wire import decode_space, deep, ext, packed, value
@@ -272,6 +280,27 @@ def test_contradictory_manifest_does_no_harm(liar: LyingServer, folder: str, wha
         # what was declared for one sub-environment decides; the rest is for the caller to read
         assert observation.shape == (suites.env.num_envs, 3)
         assert len(suites.env.step(suites.env.action_space.sample())) == 5
+
+
+def test_errors_about_spaces_do_not_paint(liar: LyingServer, folder: str) -> None:
+    """Gymnasium prints the characters of a Text as they are, which is the control."""
+    single = spaces.Text(9, charset=ESCAPES)
+    assert paints(str(single))
+    text, batch = encode_space(single), encode_space(spaces.Tuple([single] * NUM_ENVS))
+    ours = {"single_action_space": text, "action_space": batch}
+    seen = {"single_observation_space": text, "observation_space": batch}
+    worker = changed(**ours, **seen)
+    liar.lies[m.Load] = relayed(described(worker))
+    liar.lies[m.Build] = relayed(m.BuildDone(worker["envs"][0]))
+    with opened(liar, folder) as suites:
+        env = suites.env
+        errors = [
+            refuses(env.reset),
+            refuses(lambda: env.step(3)),
+            refuses(lambda: env.step(["x"])),
+        ]
+    assert [type(error) for error in errors] == [RemoteProtocolError, UniterableError, ActionError]
+    assert not any(paints(str(error)) for error in errors)
 
 
 # some: test_codec_hostile and the decoder's bombs have all that a document may be
