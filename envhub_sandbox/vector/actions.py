@@ -116,6 +116,32 @@ def _batch_of_tuples(
     )
 
 
+def batch_of_one(space: gym.Space[Any], action: Any, name: str = "action") -> Any:
+    """A batch of a single action, whose numbers keep their classes. Raises ``ActionError``: an
+    array has a wrong shape; ``batch_of`` finds what else is wrong.
+    """
+    if isinstance(space, spaces.Dict) and isinstance(action, Mapping):
+        keys = [key for key in space.spaces if key in action]
+        return {key: batch_of_one(space[key], action[key], f"{name}[{key!r}]") for key in keys}
+    if isinstance(space, spaces.Tuple) and isinstance(action, (tuple, list)):
+        parts = enumerate(zip(space.spaces, action, strict=False))
+        batch = tuple(batch_of_one(*part, f"{name}[{index}]") for index, part in parts)
+        return batch if len(batch) == len(action) else action
+    if type(action) in (bool, int, float):
+        return [action]
+    if not isinstance(space, ARRAY_SPACES):
+        return (action,)
+    array = array_of(space, action, name)
+    if array.shape != space.shape:
+        raise ActionError(
+            f"{name}: expected {space.dtype} of shape {space.shape} for {space}, got "
+            f"{array.dtype} of shape {array.shape}"
+        )
+    if type(action) is list:
+        return [action]
+    return array[None] if array.ndim or isinstance(action, np.generic) else [array]
+
+
 def action_reader(manifest: EnvManifest, count: int) -> Callable[[Any], Any]:
     """A function that checks a batch of ``count`` actions, and returns the batch for the worker.
     Trust: a manifest is input from the worker.
@@ -212,9 +238,15 @@ def _shape(space: gym.Space[Any], count: int | None) -> tuple[int, ...]:
 
 
 def _is_listed(value: Any, array: Any) -> bool:
-    """Whether the value is lists of numbers of one class, equal to ``array.tolist()``."""
+    """Whether the value is lists of numbers of one class, equal to ``array.tolist()``, or a list of
+    arrays without dimensions.
+    """
+    if type(value) not in (list, tuple):
+        return False
+    if {*map(type, value)} == {np.ndarray} and not any(item.ndim for item in value):
+        return array.dtype in _DTYPES and {item.dtype for item in value} == {array.dtype}
     kind = _PYTHONS.get(array.dtype)
-    if kind is None or type(value) not in (list, tuple):
+    if kind is None:
         return False
     for _ in range(array.ndim - 1):
         if any(type(item) is not list for item in value):

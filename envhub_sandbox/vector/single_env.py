@@ -10,17 +10,14 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Sequence
 from copy import copy
-from typing import Any, SupportsFloat, cast
+from typing import Any, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
-from gymnasium.vector.utils import concatenate, create_empty_array
 
-from envhub_sandbox.errors import ActionError
-from envhub_sandbox.vector.actions import array_of
+from envhub_sandbox.vector.actions import batch_of_one
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.sub_environment import metadata_of_one
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
@@ -35,7 +32,6 @@ _OURS = frozenset(
     {"_apart", "_begun", "_close", "_observations", "_resets_in_the_same_step", "_spec", "_vector"}
 )
 _PACKAGE = __name__.partition(".")[0]
-_PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 
 
 class SingleEnv(gym.Env[Any, Any]):
@@ -140,7 +136,7 @@ class SingleEnv(gym.Env[Any, Any]):
         self._begun = None
         step = self._vector.step if self._apart is None else self._apart.step
         try:
-            result = step(self._batch(action))
+            result = step(batch_of_one(self._vector.single_action_space, action))
         except BaseException as error:
             if shortened(error):
                 __tracebackhide__ = True  # pytest hides the frame then
@@ -304,20 +300,6 @@ class SingleEnv(gym.Env[Any, Any]):
         shown = getattr(type(self._vector), "_repr_html_", None)  # of our class, or None
         inside = "" if shown is None else shown(self._vector)
         return f"<code>{html.escape(repr(self))}</code>{inside}"
-
-    def _batch(self, action: Any) -> Any:
-        space = self._vector.single_action_space
-        if type(action) in (bool, int, float):
-            return [action]  # a Python number arrives as one
-        if isinstance(space, _PLAIN):
-            array = array_of(space, action, "action")
-            if array.shape != space.shape:
-                raise ActionError(
-                    f"action: expected {space.dtype} of shape {space.shape} for {space}, got "
-                    f"{array.dtype} of shape {array.shape}"
-                )
-            return [action] if type(action) is list else array[None]
-        return concatenate(space, [action], cast("Any", create_empty_array(space, 1)))
 
     def _first(self, batch: Any, scalars: Sequence[bool]) -> Any:
         """The only observation; ``scalars`` says which discrete members were Python numbers."""

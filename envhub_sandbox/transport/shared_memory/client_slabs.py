@@ -150,12 +150,12 @@ class ShardSlabs:
             asks[slabs.MESSAGE] = 0
             self._told = False
         for index, leaf in enumerate(leaves):
-            listed = type(leaf) is list
+            listed = 0 if type(leaf) is not list else 1 + (type(leaf[0]) is np.ndarray)
             array = np.asarray(leaf) if listed else leaf
             found = self._views.get((index, array.dtype))
             if found is None:
                 found = self._view(index, array.dtype)
-            code = found[0] + slabs.LISTED if listed else found[0]
+            code = found[0] + slabs.LISTED * listed
             if self._codes[index] != code:
                 self._codes[index] = _UNKNOWN
                 self._dtype = None

@@ -432,3 +432,56 @@ def test_a_time_limit_without_a_spec_is_known(tmp_path: Path) -> None:
         played.append([*seen, *(timed.step(0) for _ in range(6))])
         env.close()
     assert_same(played[:1] * 2, played[1:])
+
+
+_ACTIONS = """
+import gymnasium as gym
+import numpy as np
+
+class Told(gym.Env):
+    observation_space = gym.spaces.Discrete(2)
+
+    def __init__(self, kind):
+        parts = [("b", gym.spaces.Discrete(5)), ("a", gym.spaces.Box(-1, 1, ()))]
+        nested = gym.spaces.Tuple([gym.spaces.Dict(parts), gym.spaces.MultiBinary(2)])
+        spoken = gym.spaces.Tuple([gym.spaces.Text(3), gym.spaces.Discrete(5)])
+        self.action_space = {**dict(parts), "nested": nested, "spoken": spoken}[kind]
+
+    def reset(self, *, seed=None, options=None):
+        return 0, {}
+
+    def step(self, action):
+        return 0, 0.0, False, False, {"text": self.text_of(action)}
+
+    def text_of(self, value):
+        if isinstance(value, dict):
+            return [(key, self.text_of(part)) for key, part in value.items()]
+        if isinstance(value, tuple):
+            return [self.text_of(part) for part in value]
+        return [type(value).__name__, str(getattr(value, "dtype", "")), str(value)]
+
+def make_env(n_envs=1, use_async_envs=False, kind="b"):
+    return gym.vector.SyncVectorEnv([lambda: Told(kind)] * n_envs)
+"""
+_NUMBERS: list[Any] = [1, np.int64(2), np.array(3), np.array(1, np.uint8), np.array(2), 4]
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+@pytest.mark.parametrize("kind", ["b", "a", "nested", "spoken"])
+def test_an_action_arrives_as_it_is(tmp_path: Path, kind: str, lane: str) -> None:
+    """Its numbers have their classes; its mappings have the order of the space."""
+    folder = write_repository(tmp_path / "told", _ACTIONS)
+    here = make_env_of(folder)(kind=kind).envs[0]
+    flags, floats = np.array([1, 0], np.int8), np.array(0.5, np.float32)
+    given = {
+        "b": _NUMBERS,
+        "a": [0.5, np.float32(0.25), floats, np.float64(0.5), floats],
+        "nested": [({"b": number, "a": floats}, flags) for number in _NUMBERS],
+        "spoken": [("abc", number) for number in _NUMBERS],
+    }
+    with contextlib.closing(
+        SandboxEnv(folder, env_kwargs={"kind": kind}, policy={"lane": lane})
+    ) as env:
+        env.action_space.seed(3)
+        for action in (*given[kind], *(env.action_space.sample() for _ in range(3))):
+            assert env.step(action)[4] == here.step(action)[4]

@@ -11,7 +11,7 @@ import contextlib
 import mmap
 import os
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from time import perf_counter_ns
 from typing import Any
 
@@ -348,13 +348,18 @@ class ColumnLane(Lane):
         if codes != self._codes:
             self._codes, self._takes = codes, []
             for leaf, code in zip(self._layout.actions, codes, strict=True):
-                listed, code = divmod(code, slabs.LISTED)  # the caller's dtype, or Python's numbers
+                form, code = divmod(code, slabs.LISTED)
                 view = slabs.view(self._request, leaf, slabs.ACTION_DTYPES[code])
-                self._takes.append(view.tolist if listed else view.copy)
+                self._takes.append((view.copy, view.tolist, partial(_arrays_in, view))[form])
 
     def infos(self) -> dict[Any, Any]:
         """Returns the last step's infos: see ``Lane``."""
         return self._env.joined(self._pairs)
+
+
+def _arrays_in(view: Any) -> list[Any]:
+    """A list of the numbers, each an array of its own."""
+    return [view[index, ...].copy() for index in range(len(view))]
 
 
 def _raised_frame(message: m.RaisedException) -> Any:

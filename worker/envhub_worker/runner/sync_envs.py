@@ -447,6 +447,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             actions = batches.restore_batch(self.single_action_space, actions)
         if self._plain_actions:
             return iter(actions)
+        if self.single:
+            return iter((batches.only(self.single_action_space, actions),))
         spaces = self.single_action_space, self.action_space
         return iter(batches.members(*spaces, actions, self.num_envs))
 

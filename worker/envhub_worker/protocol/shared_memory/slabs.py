@@ -49,7 +49,9 @@ MAX_SLAB_BYTES = 1 << 31
 ACTION_DTYPES = tuple(BOX_DTYPES.values())
 """An action keeps the dtype that the caller gave it; the code is the place in this table."""
 LISTED = 32
-"""Added to the code, it asks for numbers of Python in lists: the caller gave such."""
+"""Added to the code, it asks for numbers of Python in lists: the caller gave such. Added twice, it
+asks for a list of arrays without dimensions.
+"""
 DTYPE_CODES = {dtype: code for code, dtype in enumerate(ACTION_DTYPES)}
 _ACTION_ITEM_BYTES = 8
 _RESULT_BYTES = 8 + 1 + 1

@@ -80,6 +80,11 @@ def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
     return [_mapped(partial(_item, slice(*window)), space, batch) for window in bounds]
 
 
+def only(space: gym.Space[Any], batch: Any) -> Any:
+    """The member of a batch of one. Mappings have the space's order, which a batch may sort."""
+    return _mapped(partial(_item, 0), space, batch)
+
+
 def members(
     space: gym.Space[Any], batched: gym.Space[Any], batch: Any, count: int
 ) -> Iterable[Any]:
