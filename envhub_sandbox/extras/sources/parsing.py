@@ -170,7 +170,12 @@ def _answer(row: Any) -> ParsedFile | None:
 Files = Mapping[str, ParsedFile | None]
 
 
-_MOST_ROUNDS = 100
+_MOST_IMPORTED = 100_000
+"""Names in all import statements that are followed."""
+_Part = tuple[str, ImportStatement | Sequence[str]]
+"""The name of a file, or of a function or class; and an import statement in it, or the names that
+its code uses.
+"""
 
 
 @dataclass(frozen=True)
@@ -202,34 +207,54 @@ def ids(snapshot: Snapshot, files: Files) -> list[tuple[str, str, int]]:
 
 
 class _ImportWalk:
-    """Follows the code that runs with ``make_env``, by the names that it uses."""
+    """Follows the code that runs with ``make_env``, by the names that it uses, each file once.
+
+    What runs only if a name is used waits until the name is used.
+    """
 
     def __init__(self, snapshot: Snapshot, files: Files) -> None:
         self._parsed = files
         self._names = {record.path for record in snapshot.files}
         self._used = {"make_env"}
-        self.files = {snapshot.path} & files.keys()
+        self._unused: dict[str, list[_Part]] = {}  # by the name that they wait for
+        self._left = _MOST_IMPORTED
+        self.files: set[str] = set()
         self.imports: set[Import] = set()
-        for _ in range(_MOST_ROUNDS):
-            before = len(self.files), len(self._used)
-            for file in sorted(self.files):
-                self._follow(file)
-            if (len(self.files), len(self._used)) == before:
-                return
+        self._walk([snapshot.path] if snapshot.path in files else [])
 
-    def _follow(self, file: str) -> None:
-        parsed = self._parsed[file] or ParsedFile()
-        for name, used in parsed.definitions:
-            if not name or name in self._used:
-                self._used.update(used)
-        for statement in parsed.imports:
-            if statement.required and (not statement.within or statement.within in self._used):
-                for module, own in _targets(statement, file, self._names):
-                    name = module.partition(".")[0]
-                    if own in self._parsed:
-                        self.files.add(own)
-                    elif not own and name and name not in sys.stdlib_module_names:
-                        self.imports.add(Import(name, file, statement.line, module))
+    def _walk(self, files: list[str]) -> None:
+        names: list[str] = []
+        while (files or names) and self._left > 0:
+            parts = self._read(files.pop()) if files else self._unused.pop(names.pop(), ())
+            for file, part in parts:
+                if isinstance(part, ImportStatement):
+                    files += self._follow(part, file)
+                else:
+                    names += [name for name in part if name not in self._used]
+                    self._used.update(part)
+
+    def _read(self, file: str) -> list[_Part]:
+        """Returns the parts of a new file that run."""
+        if file in self.files:
+            return []
+        self.files.add(file)
+        parsed, runs = self._parsed[file] or ParsedFile(), list[_Part]()
+        named: list[_Part] = [*parsed.definitions]
+        named += [(one.within, one) for one in parsed.imports if one.required]
+        for name, part in named:
+            waits = name and name not in self._used
+            (self._unused.setdefault(name, []) if waits else runs).append((file, part))
+        return runs
+
+    def _follow(self, statement: ImportStatement, file: str) -> Iterator[str]:
+        """Notes what a statement imports; yields the repository's own files among it."""
+        self._left -= len(statement.names) + 1
+        for module, own in _targets(statement, file, self._names):
+            name = module.partition(".")[0]
+            if own in self._parsed:
+                yield own
+            elif not own and name and name not in sys.stdlib_module_names:
+                self.imports.add(Import(name, file, statement.line, module))
 
 
 def _targets(statement: ImportStatement, file: str, files: set[str]) -> Iterator[tuple[str, str]]:

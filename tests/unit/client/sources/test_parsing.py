@@ -162,3 +162,26 @@ def test_a_link_is_not_followed(tmp_path: Path) -> None:
     (swapped / "env.py").symlink_to(tmp_path / "outside.py")
     assert parsing.read(snapshot)["env.py"] is not None
     assert parsing.read(replace(snapshot, root=swapped))["env.py"] is None
+
+
+def test_a_chain_of_files_with_many_imports_is_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stranger chooses both, before there is a sandbox. The control: a short chain, in any order
+    of files and of uses.
+    """
+    last = "def load():\n    import deep\ndef unused():\n    import nobody_needs\n"
+    rest = {f"m{at}.py": f"import x{at}, m{at + 1}\n" for at in range(1, 30)} | {"m30.py": last}
+    folder = write_repository(tmp_path / "r", "import m1\ndef make_env():\n    load()\n")
+    for name, text in rest.items():
+        (folder / name).write_text(text)
+    followed: list[object] = []
+    named = parsing.named_modules
+    monkeypatch.setattr(
+        parsing, "named_modules", lambda one, file: followed.append(one) or named(one, file)
+    )
+    snapshot = local(folder)
+    assert {one.name for one in imports(snapshot)} == {"deep", *(f"x{at}" for at in range(1, 30))}
+    assert len(followed) == 31
+    monkeypatch.setattr(parsing, "_MOST_IMPORTED", 30)
+    assert 9 <= len(imports(snapshot)) <= 10
