@@ -49,7 +49,9 @@ def refusal(
         text = f"cannot {operation}: the reply to the last request is late; call reset() first"
         return WorkerTimeoutError(text, request=operation)
     if state is State.DEAD:
-        text = f"cannot {operation}: the worker process has died; {_advice(restart)}"
+        once = f"make the environment again, or use {option_name('restart', 'on_reset')} and call"
+        cure = "call reset() first" if restart != "never" else f"{once} reset()"
+        text = f"cannot {operation}: the worker process has died; {cure}"
         return WorkerDiedError(text, request=operation)
     if state is State.EXPIRED:
         return expiry(operation, "it was idle for too long")
@@ -58,14 +60,6 @@ def refusal(
     if state is State.CLOSED:
         return closed_during(operation)
     return WorkerError(f"cannot {operation}: the environment is {state.value}")
-
-
-def _advice(restart: str) -> str:
-    if restart != "never":
-        return "call reset() first"
-    return (
-        f"make the environment again, or use {option_name('restart', 'on_reset')} and call reset()"
-    )
 
 
 class Restarts:

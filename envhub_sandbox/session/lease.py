@@ -147,12 +147,6 @@ class Lease:
         if self.loaded is not None:
             self.loaded.jail.output(operation, deadline)
 
-    def note_lost(self) -> None:
-        """Note that the connection to the server was lost."""
-        loaded = self.loaded  # another thread may give it back
-        if loaded is not None:
-            loaded.lost = True
-
     def watched(self, name: str) -> AttributeAnswer | None:
         """The known values of a watched attribute; None if unknown or if the state is not READY."""
         if self.lane is None or self.lifecycle.state is not State.READY:

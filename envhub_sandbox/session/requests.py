@@ -35,7 +35,7 @@ from envhub_sandbox.session.use_lock import FleetUse, UseLock
 from envhub_sandbox.system.log import warn_caller
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline, deadline_of
 from envhub_sandbox.transport.replies import RunnersDiedError
-from envhub_sandbox.transport.results import Results, StepResult, all_replies, is_of_joining
+from envhub_sandbox.transport.results import Results, StepResult, all_replies
 from envhub_sandbox.transport.shard_trials import ENOUGH_STEPS
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
@@ -495,8 +495,8 @@ class Requests(RequestOrder):
             if self._recovery is None:
                 raise self._failures.dead(error.first) from None
             return self.results.step(self._recovery.survive_step(error))
-        if is_of_joining(error):
-            self.forget_ends(deadline)
+        if isinstance(error, RemoteEnvError) and error.__cause__ is not None:
+            self.forget_ends(deadline)  # it has a cause here only if infos could not be joined
         raise error
 
     def forget_ends(self, deadline: Deadline) -> None:
@@ -593,8 +593,9 @@ class Requests(RequestOrder):
     def _failed(self, error: EnvHubError, deadline: Deadline) -> NoReturn:
         """Move to the state that follows from the error that ended a wait, and raise an error."""
         failures, operation = self._failures, self.lifecycle.request or "a request"
-        if isinstance(error, WorkerDiedError) and error.reason == "connection":
-            self._lease.note_lost()
+        loaded = self._lease.loaded  # another thread may give it back
+        if loaded and isinstance(error, WorkerDiedError) and error.reason == "connection":
+            loaded.lost = True
         if isinstance(error, WorkerTimeoutError):
             raise failures.timed_out(operation, deadline) from error
         if isinstance(error, WorkerDiedError) and error.reason == "idle":

@@ -183,20 +183,6 @@ class SpinChooser:
         if self._samples:  # the median: one hiccup of the machine must not decide
             self._best[self._spinning] = sorted(self._samples)[len(self._samples) // 2]
             self._samples.clear()
-        self._decide()
-
-    def missed(self) -> None:
-        """Note a wait that used up its whole budget; ``_MISSES`` in a row end spinning."""
-        self._misses = self._misses + 1 if self._missed_at - self._left <= 1 else 1
-        self._missed_at = self._left
-        if self._misses >= _MISSES and self._spinning:
-            self._samples.clear()
-            self._trials = 0
-            self._chosen = False
-            self._interval = _FIRST_INTERVAL
-            self._use(False, _FIRST_INTERVAL)
-
-    def _decide(self) -> None:
         if self._trials:
             self._trials -= 1
             if self._trials:
@@ -209,6 +195,17 @@ class SpinChooser:
             return
         self._trials = 2
         self._use(self._spinning, _TRIAL)
+
+    def missed(self) -> None:
+        """Note a wait that used up its whole budget; ``_MISSES`` in a row end spinning."""
+        self._misses = self._misses + 1 if self._missed_at - self._left <= 1 else 1
+        self._missed_at = self._left
+        if self._misses >= _MISSES and self._spinning:
+            self._samples.clear()
+            self._trials = 0
+            self._chosen = False
+            self._interval = _FIRST_INTERVAL
+            self._use(False, _FIRST_INTERVAL)
 
     def _use(self, spinning: bool, steps: int) -> None:
         self._spinning = spinning

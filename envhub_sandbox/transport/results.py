@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from envhub_sandbox.errors import EnvHubError, RemoteEnvError, RemoteProtocolError, remote_error
+from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, remote_error
 from envhub_sandbox.transport import infos as infos_of
 from envhub_sandbox.transport.replies import check_reply, typed_reply
 from envhub_worker.protocol import messages as m
@@ -226,11 +226,6 @@ def all_replies(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M],
     for reply in others:
         typed_reply(reply, kind)
     return cast("list[m.M]", replies)
-
-
-def is_of_joining(error: BaseException) -> bool:
-    """Whether infos could not be joined: only then does a ``RemoteEnvError`` have a cause here."""
-    return isinstance(error, RemoteEnvError) and error.__cause__ is not None
 
 
 def is_batch(part: Any) -> bool:

@@ -255,7 +255,11 @@ class ShardSlabs:
             return slabs.RAISED, message
         if isinstance(message, m.Value) and type(message.value) is dict:
             with UNTRUSTED:
-                self._learn(message.value)
+                infos, columns = message.value, columns_of(message.value) or ()
+                self._beside = {k: v for k, v in infos.items() if columns and type(k) is int}
+                self.schema = [(column, column.view(self._reply, start)) for column in columns]
+                known = (column.offset + view.nbytes for column, view in self.schema)
+                self._asks[slabs.KNOWN] = max(known, default=0)
         return kind, message
 
     def answer(self, limits: WireLimits = DEFAULT_LIMITS) -> m.Message | None:
@@ -309,13 +313,6 @@ class ShardSlabs:
         """Note that the classes, dtypes and shapes of the last step's answer are as declared."""
         if self._form is not None:
             self._checked_form = self._form
-
-    def _learn(self, infos: dict[Any, Any]) -> None:
-        start = slabs.INFOS
-        columns = columns_of(infos) or ()
-        self._beside = {key: value for key, value in infos.items() if columns and type(key) is int}
-        self.schema = [(column, column.view(self._reply, start)) for column in columns]
-        self._asks[slabs.KNOWN] = max((c.offset + v.nbytes for c, v in self.schema), default=0)
 
     def columns(self) -> dict[Any, Any]:
         """The infos that came as columns, copied into new arrays."""

@@ -193,7 +193,8 @@ class SharedMemoryLane(SlabLane):
     def _send_to_all(
         self, operation: str, packed: Sequence[Frames], *, ahead: bool = False
     ) -> None:
-        if not self._goes_by_slabs(operation, packed):
+        shards = zip(self.shards, packed, strict=True)
+        if operation in _BULKY or not all(shard.has_room(frames) for shard, frames in shards):
             self._asked = BY_SERVER
             if operation in _BATCHES:
                 self.leave_slots()
@@ -210,12 +211,6 @@ class SharedMemoryLane(SlabLane):
             spin_ns = self._spin.budget_ns if index < self._awake else 0
             shard.write_message(frames, (slot, spin_ns, cpus[index]), ring)
             shard.announce()
-
-    def _goes_by_slabs(self, operation: str, packed: Sequence[Frames]) -> bool:
-        if operation in _BULKY:
-            return False
-        pairs = zip(self.shards, packed, strict=True)
-        return all(shard.has_room(frames) for shard, frames in pairs)
 
     def _slot_for(self, operation: str, index: int) -> tuple[int, SlotRing | None]:
         """The slot for a shard's columns, and the ring whose chosen slot gets its answer.
