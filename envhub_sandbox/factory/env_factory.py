@@ -223,8 +223,13 @@ class EnvFactory:
 
     def _suites(self, manifest: Manifest, loaded: LoadedJail | None) -> EnvSuites:
         repository = self._repository
-        alone = manifest.lazy or len(manifest.envs) == 1
-        shared = None if alone else self._shared(loaded)
+        shared: SharedJails | None = None
+        if not manifest.lazy and len(manifest.envs) != 1:
+            # all environments share a jail for each worker
+            jails = [SharedJail(launcher, self._cache.forget) for launcher in self._launchers]
+            shared = dict(zip(self._launchers, jails, strict=True))
+            if loaded is not None:
+                shared[self._launcher].provide(loaded)
         makers = [partial(self._session, manifest, env, shared) for env in manifest.envs]
         sessions = [make() for make in makers]
         if loaded is not None and shared is None:
@@ -248,15 +253,6 @@ class EnvFactory:
             partial(_close_all, {} if shared is None else shared),
             repository.recipe,
         )
-
-    def _shared(self, loaded: LoadedJail | None) -> SharedJails:
-        """One jail for each worker, which all environments share."""
-        shared = {
-            launcher: SharedJail(launcher, self._cache.forget) for launcher in self._launchers
-        }
-        if loaded is not None:
-            shared[self._launcher].provide(loaded)
-        return shared
 
     def _session(
         self, manifest: Manifest, env: EnvManifest, shared: SharedJails | None

@@ -253,16 +253,13 @@ def _split_repo(repo: str, rest: str) -> tuple[str | None, str]:
         example = f"{prefix}OWNER/{steps[0]}{rest}"
         raise Wrong("the owner is missing", f"{example!r} with the owner's name{local}")
     if len(steps) > 2:
-        raise _too_many_slashes(prefix, steps, rest)
+        if "" in steps or rest:
+            raise Wrong("a repository is owner/name, with one slash", GRAMMAR)
+        path = "/".join(steps[2:])
+        path = path if path.endswith(".py") else f"{path}/{DEFAULT_PATH}"
+        cure = f"{prefix}{'/'.join(steps[:2])}:{path}"
+        raise Wrong("the path comes after a colon", repr(cure))
     return kind, "/".join(steps)
-
-
-def _too_many_slashes(prefix: str, steps: list[str], rest: str) -> Wrong:
-    if "" in steps or rest:
-        return Wrong("a repository is owner/name, with one slash", GRAMMAR)
-    path = "/".join(steps[2:])
-    path = path if path.endswith(".py") else f"{path}/{DEFAULT_PATH}"
-    return Wrong("the path comes after a colon", repr(f"{prefix}{'/'.join(steps[:2])}:{path}"))
 
 
 def _read_hf(text: str, rest: str) -> Parts:

@@ -48,17 +48,13 @@ def make(folder: Path, mode: int = SHARED_MODE) -> None:
         missing.append(above)
         above = above.parent
     for path in reversed(missing):
-        _make_one(path, mode if path == folder else SHARED_MODE)
-
-
-def _make_one(path: Path, mode: int) -> None:
-    try:
-        os.mkdir(path, PRIVATE_MODE)
-    except FileExistsError:
-        if not path.is_dir():
-            raise
-    else:
-        os.chmod(path, mode)
+        try:
+            os.mkdir(path, PRIVATE_MODE)
+        except FileExistsError:
+            if not path.is_dir():
+                raise
+        else:
+            os.chmod(path, mode if path == folder else SHARED_MODE)
 
 
 def make_private(folder: Path) -> None:
