@@ -82,17 +82,12 @@ class ContainerMonitor:
         data = os.read(self._output, 65536)
         self._tail = (self._tail + data)[-_TAIL_BYTES:]
         if self._ready >= 0:
-            self._line += data
-            self._look_for_the_announcement()
+            *lines, line = (self._line + data).split(b"\n")
+            self._line = line[-_LINE_BYTES:]
+            for text in lines:
+                if text.startswith(b'{"envhub-worker"'):
+                    self._tell(text)  # the first of them; later ones are not told
         return bool(data)
-
-    def _look_for_the_announcement(self) -> None:
-        *lines, self._line = self._line.split(b"\n")
-        self._line = self._line[-_LINE_BYTES:]
-        for line in lines:
-            if line.startswith(b'{"envhub-worker"'):
-                self._tell(line)
-                return
 
     def _tell(self, document: bytes) -> None:
         if self._ready >= 0:

@@ -280,7 +280,19 @@ class UploadedRepository(Sandbox):
         """Upload the files and check the packages, in one thread of this process at a time."""
         with server.uploading:
             if self.order is not None:
-                self._check_packages(self.order, client, deadline)
+                # the server makes them again if it is new or has removed them, which does not
+                # count towards the timeout of a start
+                began = time.monotonic()
+                deadline.postpone(_MAKE_S)
+                try:
+                    packages = request_packages(self.order, client, deadline)
+                finally:
+                    deadline.postpone(time.monotonic() - began - _MAKE_S)
+                if packages is None or packages.packages != self.packages:
+                    raise DependencyError(
+                        "the server no longer has these packages, and would choose other versions "
+                        "now: make the environment again"
+                    )
             here = {copy.tree for copy in order.repositories if copy.tree}
             trees = {tree: self._bring(Path(tree), client, deadline) for tree in sorted(here)}
             snapshot = self._bring(self.snapshot, client, deadline)
@@ -292,21 +304,3 @@ class UploadedRepository(Sandbox):
         if root not in self._files:
             self._files[root] = listing(root)
         return upload(client, root, self._files[root], deadline)[0]
-
-    def _check_packages(
-        self, order: m.NeedPackages, client: WorkerConnection, deadline: Deadline
-    ) -> None:
-        """Have the server make the packages again if it is new or has removed them. This time
-        does not count towards the timeout of a start.
-        """
-        began = time.monotonic()
-        deadline.postpone(_MAKE_S)
-        try:
-            packages = request_packages(order, client, deadline)
-        finally:
-            deadline.postpone(time.monotonic() - began - _MAKE_S)
-        if packages is None or packages.packages != self.packages:
-            raise DependencyError(
-                "the server no longer has these packages, and would choose other versions now: "
-                "make the environment again"
-            )

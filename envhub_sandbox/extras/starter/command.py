@@ -40,7 +40,16 @@ def init(
     [bold]envhub init my-env && envhub run ./my-env[/bold]
     """
     name = repository_name(folder)
-    _write(folder, starter(name, time.localtime().tm_year, lerobot=lerobot))
+    files = starter(name, time.localtime().tm_year, lerobot=lerobot)
+    try:
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise UsageError(f"{folder} exists and is not empty; choose another folder")
+        for path, text in files.items():
+            target = folder / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"{folder} cannot be written: {error.strerror or error}") from error
     if make_checkout := extras.find("envhub_sandbox.extras.sources.checkout", "make_checkout"):
         make_checkout(folder)
     shown = safe_line(str(folder) if folder.is_absolute() else f"./{folder}")
@@ -57,19 +66,6 @@ def repository_name(folder: Path) -> str:
             "a letter or digit at both ends, and no '--' or '..'"
         )
     return name
-
-
-def _write(folder: Path, files: dict[str, str]) -> None:
-    """Write all files, or none. Raises ``UsageError``."""
-    try:
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise UsageError(f"{folder} exists and is not empty; choose another folder")
-        for path, text in files.items():
-            target = folder / path
-            target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"{folder} cannot be written: {error.strerror or error}") from error
 
 
 # --- the files: an environment that loads, steps and draws as it is -------------------------------

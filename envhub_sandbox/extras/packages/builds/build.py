@@ -164,21 +164,17 @@ def _fetched(source: Source, place: Path, tell: Tell) -> Path:
     tell(f"fetching the source of {_title(source)}")
     if source.commit:
         download.check_out(source.url, source.commit, tree, tell)
-        return _below(tree, source)
+        folder = tree
+        for step in filter(None, source.subdirectory.split("/")):
+            if step in (".", "..") or not (folder / step).is_dir():
+                raise DependencyError(
+                    f"{_title(source)} has no folder {source.subdirectory[:200]!r}. {source.where}",
+                    reason="requirement",
+                )
+            folder = folder / step
+        return folder
     archive = place / Path(unquote(urlsplit(source.url).path)).name
     return apart.fetch(source.url, source.sha256, archive, tree, _title(source))
-
-
-def _below(tree: Path, source: Source) -> Path:
-    folder = tree
-    for step in filter(None, source.subdirectory.split("/")):
-        if step in (".", "..") or not (folder / step).is_dir():
-            raise DependencyError(
-                f"{_title(source)} has no folder {source.subdirectory[:200]!r}. {source.where}",
-                reason="requirement",
-            )
-        folder = folder / step
-    return folder
 
 
 def _title(source: Source) -> str:
@@ -207,7 +203,15 @@ class _Build:
                 return self._tried(further)
             except BuildFailedError as failed:
                 if not (more := self._remedy(str(failed), further)):
-                    raise self._failed(str(failed)) from failed
+                    source, advice = self._source, project.advice(str(failed))
+                    advice = f"{advice}. " if advice else ""
+                    needed_by = f" ({source.where})" if source.where else ""
+                    raise DependencyError(
+                        f"{_title(source)}{needed_by} has no wheel for Python "
+                        f"{self._interpreter.version}, and building its source in a jail failed. "
+                        f"{advice}The build says:\n{failed}",
+                        reason="resolution",
+                    ) from failed
                 further = (*further, *more)
 
     def _remedy(self, log: str, tried: tuple[str, ...]) -> tuple[str, ...]:
@@ -274,14 +278,3 @@ class _Build:
         )
         environment = environments.provide(lock, self._interpreter, self._tell)
         return environment.python, str(environment.packages)
-
-    def _failed(self, log: str) -> DependencyError:
-        source, advice = self._source, project.advice(log)
-        advice = f"{advice}. " if advice else ""
-        needed_by = f" ({source.where})" if source.where else ""
-        return DependencyError(
-            f"{_title(source)}{needed_by} has no wheel for Python {self._interpreter.version}, and "
-            f"building its source in a jail failed. {advice}The build says:\n"
-            f"{log}",
-            reason="resolution",
-        )

@@ -22,7 +22,7 @@ from envhub_sandbox.cli.shared.console import (
     show,
 )
 from envhub_sandbox.cli.shared.exits import UsageError
-from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.errors import LockError, SandboxUnavailableError
 from envhub_sandbox.system.platform import IS_LINUX, NAME
 
 if TYPE_CHECKING:
@@ -232,7 +232,10 @@ def _with_spaces(
         path = Path(folder, "pylock.toml")
         lockfile.write(replace(made, spaces=None), path)
         with make_env(snapshot.reference, env_kwargs=env_kwargs, lock=path, **hub) as suites:
-            return making.with_spaces(made, env_kwargs, suites)
+            arguments = lockfile.arguments_text(env_kwargs)
+            if arguments is None:
+                raise LockError("env_kwargs have values that a lock cannot record")
+            return replace(made, spaces=lockfile.Spaces(arguments, making.tasks_of(suites)))
 
 
 def _print(

@@ -21,7 +21,6 @@ from envhub_sandbox.extras.packages.locks import pylock
 from envhub_sandbox.extras.packages.locks.pylock import PylockPackage, as_toml, rows
 from envhub_sandbox.extras.packages.request import DATE
 from envhub_sandbox.extras.sources.toml import table
-from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.system.folders import write_whole_file
 
 FORMAT = 1
@@ -119,11 +118,6 @@ class LockFile:
     assets: tuple[str, ...] = ()
 
 
-def repository_of(snapshot: Snapshot) -> str:
-    """Returns the name of a snapshot's repository in a lock file."""
-    return LOCAL if snapshot.is_local else snapshot.name
-
-
 def reference_of(lock: LockFile) -> str | None:
     """Returns the pinned reference; None for a folder, whose path is unknown."""
     if lock.repository == LOCAL:
@@ -177,9 +171,12 @@ class _Reader:
         if "exclude-newer" in ours:
             texts["exclude_newer"] = text(ours, "exclude-newer", re.compile(DATE))
         texts |= {name: self._requirements(name) for name in _REQUIREMENTS if name in ours}
+        files = self._ours.get("files")
+        if not isinstance(files, dict) or not 1 <= len(files) <= MAX_FILES:
+            raise self._wrong("files")
         return LockFile(
             **texts,
-            files=self._files(),
+            files={name: self._text(files, name, _DIGEST) for name in files},
             runner=Runner(**{name: text(ours, name, form) for name, form in _RUNNER.items()}),
             packages=packages,
             inferred=self._texts("inferred"),
@@ -205,12 +202,6 @@ class _Reader:
             f"{name} in [tool.envhub] of {self._where} is missing, or is not as 'envhub lock' "
             "writes it"
         )
-
-    def _files(self) -> dict[str, str]:
-        files = self._ours.get("files")
-        if not isinstance(files, dict) or not 1 <= len(files) <= MAX_FILES:
-            raise self._wrong("files")
-        return {name: self._text(files, name, _DIGEST) for name in files}
 
     def _texts(self, name: str) -> tuple[str, ...]:
         rows = self._ours.get(name, [])

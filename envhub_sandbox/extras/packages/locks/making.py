@@ -11,18 +11,16 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from envhub_sandbox.errors import LockDriftError, LockError
+from envhub_sandbox.errors import LockDriftError
 from envhub_sandbox.extras.packages import interpreters
 from envhub_sandbox.extras.packages.declared import WantedPackage, parse_requirement
-from envhub_sandbox.extras.packages.locks import lockfile, pylock
+from envhub_sandbox.extras.packages.locks import pylock
 from envhub_sandbox.extras.packages.locks.day import settled
 from envhub_sandbox.extras.packages.locks.lockfile import (
     LOCAL,
     LockFile,
     Runner,
-    Spaces,
     TaskFingerprint,
-    repository_of,
 )
 from envhub_sandbox.extras.packages.locks.pylock import PylockPackage
 from envhub_sandbox.extras.packages.request import Choice, request_of
@@ -65,7 +63,7 @@ def with_files(lock: LockFile, snapshot: Snapshot) -> LockFile:
     """Returns the lock with the files of a snapshot."""
     return replace(
         lock,
-        repository=repository_of(snapshot),
+        repository=LOCAL if snapshot.is_local else snapshot.name,
         commit=snapshot.commit,
         entry=snapshot.path,
         files={record.path: record.digest for record in snapshot.files},
@@ -202,16 +200,6 @@ def relisted(lock: LockFile) -> LockFile:
     listed = pylock.listed(pins, interpreter.path, options, refresh=True)
     packages = tuple(sorted((*built, *listed), key=attrgetter("name")))
     return replace(lock, packages=packages)
-
-
-def with_spaces(
-    lock: LockFile, env_kwargs: Mapping[str, Any], suites: Mapping[str, Mapping[Any, Any]]
-) -> LockFile:
-    """Returns the lock with the spaces that ``make_env`` returned for these arguments."""
-    arguments = lockfile.arguments_text(env_kwargs)
-    if arguments is None:
-        raise LockError("env_kwargs have values that a lock cannot record")
-    return replace(lock, spaces=Spaces(arguments, tasks_of(suites)))
 
 
 def tasks_of(suites: Mapping[str, Mapping[Any, Any]]) -> tuple[TaskFingerprint, ...]:

@@ -75,11 +75,6 @@ def is_chosen() -> bool:
     return any(name in variables for name in _CHOOSE_AN_INDEX)
 
 
-def hides_refusals() -> bool:
-    """Tells whether uv treats an index that requires a login as one without the package."""
-    return environment().get("UV_INDEX_STRATEGY", "").startswith("unsafe")
-
-
 def options() -> tuple[str, ...]:
     """Returns options for uv's command line: no variable of uv's turns the index off."""
     return ("--no-index",) if environment().get("UV_NO_INDEX", "").lower() in _YES else ()

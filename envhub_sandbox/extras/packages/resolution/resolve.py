@@ -178,8 +178,9 @@ def _compiled(
     except DependencyError as error:
         if error.reason != "resolution":
             raise
-        if _NOT_FOUND in str(error) and index.hides_refusals():
-            _raise_refusal(ask)
+        strategy = index.environment().get("UV_INDEX_STRATEGY", "")
+        if _NOT_FOUND in str(error) and strategy.startswith("unsafe"):
+            _raise_refusal(ask)  # uv treats an index that refuses us as one without the package
         what = _what_is_required(str(error), [*every, *request.constraints, *request.override])
         raise DependencyError(f"{error}\n{what}", reason="resolution") from error
 
