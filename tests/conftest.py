@@ -1,5 +1,6 @@
 """What holds for every test: a cache of its own, and the plugins that all of them run with."""
 
+import fcntl
 import gc
 import os
 import signal
@@ -40,6 +41,24 @@ gymnasium.logger.colorize = lambda text, *_, **__: text
 # What a shell starts in the background ignores Ctrl-C, and so would every client of our tests.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[object]:
+    """The first process of a run compiles the tests; the others wait, and read what it wrote.
+    None of them looks for garbage meanwhile: there is none.
+    """
+    gc.disable()
+    tests = os.open(Path(__file__).parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(tests, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        fcntl.flock(tests, fcntl.LOCK_SH)
+    try:
+        return (yield)
+    finally:
+        os.close(tests)
+        gc.enable()
 
 
 @pytest.hookimpl(trylast=True)
