@@ -25,6 +25,8 @@ WAYS: dict[str, dict[str, Any]] = {
 class Told(gym.Env[Any, Any]):
     """Tells what it has; its infos hold a space and its generator."""
 
+    metadata: dict[Any, Any] = {"render_modes": [], 3: "three", ("a", None): 1.5}  # noqa: RUF012
+
     def __init__(self, number: int = 0) -> None:
         self.observation_space = spaces.Dict(
             {"b": spaces.Box(-1, 1, (2,)), "a": spaces.Graph(spaces.Box(0, 1, (1,)), None)}
@@ -125,7 +127,15 @@ def test_attributes_and_methods_of_one(make: Callable[..., Any]) -> None:
             *(hasattr(one, name) for name in ("number", "add", "step", "nothing", "env")),
             *(hasattr(one.unwrapped, name) for name in ("number", "add", "nothing", "env")),
             *(one.has_wrapper_attr("number"), one.has_wrapper_attr("nothing")),
-            *(one.metadata, one.render_mode, one.np_random_seed, one.np_random, one.unwrapped.spec),
+            *(
+                env.metadata,
+                env.envs[0].metadata,
+                one.metadata,
+                one.render_mode,
+                one.np_random_seed,
+                one.np_random,
+                one.unwrapped.spec,
+            ),
             isinstance(one, gym.Env),
         ]
 

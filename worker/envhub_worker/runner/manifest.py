@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from gymnasium.wrappers import TimeLimit
 
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
-from envhub_worker.protocol.manifest.names import MAX_NAMES
+from envhub_worker.protocol.manifest.names import MAX_NAMES, PLAIN_KEYS
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner.described import facts_of
 from envhub_worker.runner.sync_envs import SubEnvs
@@ -104,9 +104,14 @@ def _attributes(env: Any) -> tuple[str, ...]:
     return tuple(own[:MAX_NAMES])
 
 
-def _metadata(env: Any) -> dict[str, Any]:
+def _metadata(env: Any) -> dict[Any, Any]:
     metadata = dict(getattr(env, "metadata", None) or {})
-    return {str(key): value for key, value in metadata.items() if key != "autoreset_mode"}
+    return {_key(key): value for key, value in metadata.items() if key != "autoreset_mode"}
+
+
+def _key(key: Any) -> Any:
+    parts = key if type(key) is tuple else (key,)
+    return key if all(type(part) in (str, *PLAIN_KEYS) for part in parts) else str(key)
 
 
 def _interpreter() -> dict[str, str]:

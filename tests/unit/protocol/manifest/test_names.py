@@ -102,7 +102,7 @@ def test_metadata_on_which_gymnasium_acts_is_typed(key: str, lie: object) -> Non
         {"a": np.zeros(MAX_METADATA)},
         {"a": {"b": [[0] * (MAX_METADATA // 2)] * 3}},
         {"a": np.array([[0] * 100] * 100, object)},
-        {3: 4},
+        {b"3": 4},
         [],
     ],
     ids=["list", "array", "nested", "objects", "key", "type"],

@@ -23,6 +23,7 @@ from envhub_worker.protocol.manifest.names import (
     checked_name,
     is_servable,
     optional_name,
+    plain_keys,
     string_keys,
 )
 from envhub_worker.protocol.records import dataclass
@@ -70,7 +71,7 @@ class EnvManifest:
     observation_space: gym.Space[Any]
     action_space: gym.Space[Any]
     autoreset_mode: str | None
-    metadata: dict[str, Any]
+    metadata: dict[Any, Any]
     render_mode: str | None
     spec: dict[str, Any] | None
     attributes: tuple[str, ...]
@@ -225,10 +226,10 @@ MAX_FPS = 1_000_000.0
 _NUMBERS = (int, float, np.integer, np.floating)
 
 
-def read_metadata_facts(value: object) -> dict[str, Any]:
+def read_metadata_facts(value: object) -> dict[Any, Any]:
     """Reads metadata: free data for people, but keys that Gymnasium acts on have checked types."""
-    metadata = string_keys(value, "metadata")
-    _count(metadata, MAX_METADATA)
+    metadata = plain_keys(value, "metadata")
+    _count([*metadata, *metadata.values()], MAX_METADATA + len(metadata))
     return {
         key: item
         for key, item in metadata.items()

@@ -107,13 +107,27 @@ def optional_name(value: object, role: str) -> str | None:
     return None if value is None else checked_name(value, role)
 
 
-def string_keys(value: object, role: str) -> dict[str, Any]:
-    """Returns a mapping whose keys pass ``checked_name``. Raises ``RemoteProtocolError``."""
+PLAIN_KEYS = (int, float, bool, type(None))
+"""Types of keys of metadata, beside text."""
+
+
+def plain_keys(value: object, role: str) -> dict[Any, Any]:
+    """Like ``string_keys``, but a key may also be of ``PLAIN_KEYS``, or a tuple of such keys."""
     if type(value) is not dict or len(value) > MAX_NAMES:
         raise RemoteProtocolError(f"{role} is not a mapping of at most {MAX_NAMES} entries")
     for key in value:
-        checked_name(key, role)
+        for part in key if type(key) is tuple else (key,):
+            if type(part) not in PLAIN_KEYS:
+                checked_name(part, role)
     return value
+
+
+def string_keys(value: object, role: str) -> dict[str, Any]:
+    """Returns a mapping whose keys pass ``checked_name``. Raises ``RemoteProtocolError``."""
+    mapping = plain_keys(value, role)
+    for key in mapping:
+        checked_name(key, role)
+    return mapping
 
 
 CONVERTED = "envhub_converted"
