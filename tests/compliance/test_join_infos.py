@@ -2,6 +2,8 @@
 
 import itertools
 import warnings
+from decimal import Decimal
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -59,7 +61,8 @@ NUMBERS = st.sampled_from([1, 2, 0.5, True, 2**60 + 1, np.int64(300), np.int8(3)
 ARRAYS = st.sampled_from([np.ones(2), np.ones(2, np.int8), np.ones((2, 1)), np.ones((0, 2))])
 ALIKE = st.fixed_dictionaries({"array": ARRAYS, "inner": st.fixed_dictionaries({"n": NUMBERS})})
 NUMBER = st.fixed_dictionaries({"number": NUMBERS})
-ANY = st.sampled_from([1, 0.5, "text", None, np.float64(0.1), np.array(None), np.ones(2), {}])
+WORDS = ["text", None, Decimal("2.5"), Decimal(0), Fraction(7, 2)]
+ANY = st.sampled_from([1, 0.5, True, np.float64(0.1), np.array(None), np.ones(2), {}, *WORDS])
 UNLIKE = st.tuples(INFO, st.fixed_dictionaries({}, optional={"number": NUMBERS, "any": ANY}))
 
 
@@ -85,6 +88,17 @@ def test_shards_join_as_one_batch(infos: list[dict[str, Any]], data: st.DataObje
                 results.infos(parts)
             return
         assert_same(expected, results.infos(parts))
+
+
+def test_structures_are_tuples_in_every_row() -> None:
+    """Also in rows without the key, however the sub-environments are cut into shards."""
+    structure = np.dtype([("a", np.int64), ("b", np.float32)])
+    one = [{}, {"x": np.array((1, 2.5), structure), "y": np.array([(3, 4)], structure)}, {}]
+    space = spaces.Discrete(2)
+    results = Results(wire.env_manifest(space, space, 3), [(0, 1), (1, 3)])
+    infos = results.infos([sent(one[:1]), sent(one[1:])])
+    expected = m.unpack(m.pack(m.Value(added(one))))
+    assert_same(expected.value, infos)  # type: ignore[attr-defined]
 
 
 def test_columns_of_a_slice_are_recurring_forms() -> None:

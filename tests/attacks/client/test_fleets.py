@@ -132,8 +132,19 @@ OWN: dict[str, dict[Any, Any]] = {
     "of a row of the other's": {2 * NUM_ENVS: {"a": -1}},
     "of no row": {"0": {"a": -1}},
     "that are no mapping": {0: [1]},
-    "whose mask is no text": {0: {"a": -1}, batches.APART_FORMS: {0: {"a": (3, True, {})}}},
-    "whose inner forms are none": {0: {"a": {}}, batches.APART_FORMS: {0: {"a": ("_a", False, 1)}}},
+    "whose mask is no text": {0: {"a": -1}, batches.APART_FORMS: {0: {"a": (3, True, {}, {})}}},
+    "whose inner forms are none": {
+        0: {"a": {}},
+        batches.APART_FORMS: {0: {"a": ("_a", False, 1, {})}},
+    },
+    "whose numbers are texts": {
+        0: {"a": -1},
+        batches.APART_FORMS: {0: {"a": ("_a", True, {}, {"i": "1"})}},
+    },
+    "whose blank structure is large": {
+        0: {"a": -1},
+        batches.APART_FORMS: {0: {"a": ("_a", True, {}, {"V": np.zeros(9)})}},
+    },
     "whose forms are none": {0: {"a": 1}, batches.APART_FORMS: 3},
     "with marks of all rows": {"x": np.ones(ALL), "_x": np.ones(ALL, bool)},
     "in columns of all rows": {"a": np.zeros(ALL), "_a": 1, batches.APART_CLASSES: _PLAIN},

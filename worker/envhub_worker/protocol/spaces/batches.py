@@ -6,6 +6,7 @@ custom space, a tuple of members. Followed: ``gymnasium.vector.utils.iterate`` a
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
@@ -363,28 +364,74 @@ _SCALARS = frozenset({int, float, bool})
 _NUMBERS = _SCALARS | {np.dtype(char).type for char in "bBhHiIlLqQefd"}
 """Classes whose values lose nothing in an array of their dtype, but which of them they had."""
 _NO_FORMS: Forms = {}
-_NO_FORM: tuple[str, bool, Forms] = ("", False, _NO_FORMS)
+_NO_FORM: tuple[str, bool, Forms, Forms] = ("", False, _NO_FORMS, _NO_FORMS)
 _SAME = _NUMBERS | {str, bytes, type(None), list, tuple, dict, np.ndarray, np.bool_}
 """Values of these classes are joined alike on both sides."""
 
 
 def forms_of(info: dict[Any, Any]) -> Forms:
     """For each entry whose class the wire changes: the name of its mask, whether its column has
-    dtype object, and the same for nested entries. An ``IntEnum``'s member arrives as its number.
+    dtype object, the same for nested entries, and its ``_casts``. An ``IntEnum``'s member arrives
+    as its number.
     """
     forms: Forms = {}
     for key, value in info.items():
         inner = forms_of(value) if isinstance(value, dict) else {}
-        if inner or type(key) is not str or type(value) not in _SAME:
+        casts = _casts(value)
+        if inner or casts or type(key) is not str or type(value) not in _SAME:
             is_array = isinstance(value, (dict, np.ndarray)) or is_scalar(type(value))
-            forms[key] = (f"_{key}", not is_array, inner)
+            forms[key] = (f"_{key}", not is_array, inner, casts)
     return forms
+
+
+_CASTS = {"i": int, "f": float, "b": bool}
+"""By the kind of an array's dtype, what it makes of other objects (``Decimal``)."""
+_CONVERTERS = ("__int__", "__float__", "__bool__", "__len__")
+
+
+def _casts(value: Any) -> Forms:
+    """What a column makes of an object that arrives as its text, by the kind of the column's dtype;
+    of an array of structures, which arrive as tuples, under "V" an array of a blank one.
+    """
+    kind = type(value)
+    if isinstance(value, np.ndarray):
+        return {"V": np.zeros(1, value.dtype)} if value.dtype.names else {}
+    is_text = kind in _SAME or hasattr(kind, "__array__")
+    if is_text or not any(hasattr(kind, name) for name in _CONVERTERS):
+        return {}
+    casts: Forms = {}
+    for name, number in _CASTS.items():
+        cell: Any = np.zeros(1, number)
+        with contextlib.suppress(Exception):  # the object's own code
+            cell[0] = value
+            casts[name] = cell.item()
+    return casts
+
+
+def _are_casts(casts: Any) -> bool:
+    return type(casts) is dict and all(
+        type(cast) is _CASTS[kind]
+        if kind in _CASTS
+        else kind == "V" and type(cast) is np.ndarray and cast.shape == (1,)
+        for kind, cast in casts.items()
+    )
+
+
+def _cast(casts: Forms, value: Any, column: Any) -> Any:
+    """What to write into a column in place of a value."""
+    if isinstance(value, np.ndarray):
+        return value if value.ndim else value[()]  # the tuple of a structure
+    kind = getattr(getattr(column, "dtype", None), "kind", "O")
+    return casts.get({"u": "i"}.get(kind, kind), value)
 
 
 def are_forms(forms: Any) -> bool:
     """Whether a value has the structure of ``forms_of``'s result. Trust: it may be anything."""
     return type(forms) is dict and all(
-        type(form) is tuple and list(map(type, form)) == [str, bool, dict] and are_forms(form[2])
+        type(form) is tuple
+        and list(map(type, form)) == [str, bool, dict, dict]
+        and are_forms(form[2])
+        and _are_casts(form[3])
         for form in forms.values()
     )
 
@@ -438,7 +485,7 @@ def add_info(
     """Does what ``VectorEnv._add_info`` does, without its allocations."""
     for key, value in info.items():
         array: Any
-        mask_key, is_object, inner = forms.get(key, _NO_FORM) if forms else _NO_FORM
+        mask_key, is_object, inner, casts = forms.get(key, _NO_FORM) if forms else _NO_FORM
         try:
             if key == "final_obs":
                 array = infos[key] if key in infos else column(None, count)
@@ -447,8 +494,12 @@ def add_info(
                 array = add_info(infos.get(key, {}), value, index, count, column, inner)
             else:
                 first = None if is_object else value
-                array = infos[key] if key in infos else column(first, count)
-                array[index] = value
+                array = infos.get(key)
+                if key not in infos:
+                    array = column(first, count)
+                    if "V" in casts:
+                        array.fill(casts["V"][0])
+                array[index] = _cast(casts, value, array) if casts else value
             mask_key = mask_key or f"_{key}"
             mask = infos.get(mask_key)
             if mask is None:
