@@ -97,12 +97,23 @@ def test_for_whom_it_is_playable_is_noted(tmp_path: Path) -> None:
         assert part in finding.message
 
 
-def test_a_success_by_another_name_is_noted(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("info", "end"),
+    [('{"success": self.is_late()}', ", not 'success'"), ('{"is_success": None}', " as a bool")],
+)
+def test_a_success_by_another_name_is_noted(info: str, end: str, tmp_path: Path) -> None:
     """LeRobot would count none; the honest one is the control."""
-    text = _HONEST.replace('{"is_success": self.is_late()}', '{"success": self.is_late()}')
+    text = _HONEST.replace('{"is_success": self.is_late()}', info)
     [finding] = judged(repository(tmp_path / "walk", text), resets=0).findings
     assert finding.id == "lerobot"
-    assert finding.message.endswith("info['is_success'] at the end of an episode, not 'success'")
+    assert finding.message.endswith(f"info['is_success'] at the end of an episode{end}")
+
+
+def test_a_dtype_that_changes_late_in_an_episode_is_found(tmp_path: Path) -> None:
+    """The honest one above is the control."""
+    late = _PLACE.replace("np.float32", "np.float64 if self.count > 8 else np.float32")
+    [finding] = judged(repository(tmp_path / "walk", _HONEST.replace(_PLACE, late))).findings
+    assert finding.id == "observation-dtype"
 
 
 def test_each_mode_that_is_declared_is_rendered(tmp_path: Path) -> None:

@@ -53,9 +53,11 @@ def check_observations(
 def _check(space: gym.Space[Any], operation: str, observations: Mapping[int, Any]) -> None:
     for index, observation in observations.items():
         if not holds(space, observation):
+            is_space = isinstance(observation, gym.Space)
+            seen = batches.shown(observation) if is_space else one_line(repr(observation), _SHOWN)
             raise OutsideSpaceError(
                 f"{operation} returned an observation outside its space: sub-environment {index} "
-                f"gave {one_line(repr(observation), _SHOWN)}, which is not in {space}"
+                f"gave {seen}, which is not in {space}"
             )
 
 

@@ -140,6 +140,8 @@ def lerobot_lacks(
         alike = (key for key in keys if "succe" in key.lower() and not key.startswith("_"))
         others = ", ".join(sorted(map(repr, alike)))
         instead = f", not {printable(others, _LONGEST)}" if others else ""
+        if "is_success" in keys:
+            instead = " as a bool"
         lacks.append(f"info['is_success'] at the end of an episode{instead}")
     rate = getattr(env, "_manifest", env).metadata.get("render_fps")  # the repository's own value
     if env.render_mode in FILMED and rate is not None and not hasattr(rate, "numerator"):

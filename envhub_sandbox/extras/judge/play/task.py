@@ -41,8 +41,6 @@ _BEGUN = 4
 """Steps after each reset, before resources are counted."""
 _STATISTICS = ("obs_rms", "return_rms")
 """The running statistics of Gymnasium's NormalizeObservation and NormalizeReward."""
-_ALONE = 5
-"""Steps of a single sub-environment."""
 
 
 class TaskJudge:
@@ -342,21 +340,23 @@ class TaskJudge:
     def _alone(self) -> None:
         """Check the results of one sub-environment before Gymnasium writes them into a batch."""
         uncast: list[str] = []
-        types: list[str] = []
+        types: dict[str, str] = {}  # the first fault of each part
         handles = getattr(self._env, "envs", None)
         # a vector class without sub-environments that can be stepped raises one of these
         with contextlib.suppress(AttributeError, TypeError, ValueError, NotImplementedError):
             if handles:
                 self._drive(handles[0], uncast, types)
         self._say("observation-dtype", uncast[:1])
-        self._say("step-types", dict.fromkeys(types))
+        self._say("step-types", types.values())
 
-    def _drive(self, handle: Any, uncast: list[str], types: list[str]) -> None:
+    def _drive(self, handle: Any, uncast: list[str], types: dict[str, str]) -> None:
+        """Play one episode, because many a fault is in its last step alone."""
         uncast += self._outside(handle.reset(seed=self._asked.seed)[0])
-        for _ in range(min(_ALONE, self._asked.steps)):
+        for _ in range(self._asked.steps):
             result = handle.step(self._env.single_action_space.sample())
             uncast += self._outside(result[0])
-            types += _untyped(*result[1:])
+            for part, text in _untyped(*result[1:]):
+                types.setdefault(part, text)
             if np.any(result[2]) or np.any(result[3]):
                 return
 
@@ -377,16 +377,22 @@ def _would_be_cast(value: Any, space: spaces.Space[Any]) -> bool:
     return isinstance(space, spaces.Box) and isinstance(value, (list, tuple, int, float))
 
 
-def _untyped(reward: Any, terminated: Any, truncated: Any, info: Any) -> Iterator[str]:
-    """Yields the faults that Gymnasium's ``check_env`` refuses. Trust: input from the worker."""
+def _untyped(reward: Any, terminated: Any, truncated: Any, info: Any) -> Iterator[tuple[str, str]]:
+    """Yields parts with a fault that Gymnasium's ``check_env`` refuses, and a text for each.
+    Trust: input from the worker.
+    """
     is_vector = isinstance(reward, np.ndarray) and reward.size > 1  # as mo-gymnasium's
     if not is_vector and not isinstance(reward, (int, float, np.integer, np.floating)):
-        yield f"the reward is {batches.shown(reward)}, not a number"
+        yield "reward", f"the reward is {_seen(reward)}, not a number"
     for name, value in (("terminated", terminated), ("truncated", truncated)):
         if not isinstance(value, (bool, np.bool_)):
-            yield f"{name} is {batches.shown(value)}, not a bool"
+            yield name, f"{name} is {_seen(value)}, not a bool"
     if not isinstance(info, Mapping):
-        yield f"the info is {batches.shown(info)}, not a dict"
+        yield "info", f"the info is {_seen(info)}, not a dict"
+
+
+def _seen(value: Any) -> str:
+    return f"{'an array: ' if isinstance(value, np.ndarray) else ''}{batches.shown(value)}"
 
 
 def _can_be_guessed(space: spaces.Space[Any]) -> bool:

@@ -63,6 +63,8 @@ KINDS: dict[str, tuple[Any, Any, tuple[Any, ...], Any, str, str]] = {
         "reset of sub-environment 0 returned the space Box(-10.0, 10.0, (4,), float32), its"),
     "nothing": (BOX, SEEN, whole(None), None, "later",
         "step of sub-environment 0 returned None, its observation_space is Box(-10.0"),
+    "the info in its place": (BOX, SEEN, whole({}), None, "later",
+        "step of sub-environment 0 returned an empty dict, its observation_space is Box(-10.0"),
     "agents": (BOX, SEEN, whole(AGENTS), None, "later",
         "returned dict with 'agent_0', 'agent_1', its observation_space is Box(-10.0"),
     "a key too few": (NESTED, {"near": SEEN}, whole(), None, "first",

@@ -18,7 +18,7 @@ from gymnasium import spaces
 from gymnasium.spaces.graph import GraphInstance
 from gymnasium.vector.utils import iterate
 
-from envhub_worker.protocol.codec.inert import inert_copy, one_line
+from envhub_worker.protocol.codec.inert import RemoteObject, inert_copy, one_line
 from envhub_worker.protocol.errors import FAULTS, MessageTooLargeError
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, OneOf
 
@@ -182,9 +182,11 @@ def shown(value: Any) -> str:
         return one_line(f"{kind}{value.dtype} {tuple(value.shape)}", _SHOWN)
     if value is None:
         return "None"
+    if type(value) is dict and not value:
+        return "an empty dict"
     if type(value) is dict:
         return f"dict with {one_line(', '.join(map(repr, itertools.islice(value, _KEYS))), _SHOWN)}"
-    inert = inert_copy(value)
+    inert = value if isinstance(value, RemoteObject) else inert_copy(value)
     return f"{inert.type_name} {one_line(inert.text, _SHOWN)}"
 
 

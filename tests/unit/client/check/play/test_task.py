@@ -23,6 +23,6 @@ from tests.support import inside
     ],
 )
 def test_a_step_has_the_types_of_gymnasium(result: tuple[Any, ...], wrong: str) -> None:
-    found = " ".join(inside.wrong_types(*result))
+    found = " ".join(text for _, text in inside.wrong_types(*result))
     assert found.startswith(wrong)
     assert bool(found) is bool(wrong)
