@@ -92,7 +92,7 @@ def why_no_terminal(error: BaseException) -> str:
         return ""
     return (
         'A jail of profile "strict" has at most 64 pseudo terminals, one of another profile has '
-        "none; no jail has /dev/tty"
+        "none; /dev/tty is the one that pty.fork() gave the process"
     )
 
 

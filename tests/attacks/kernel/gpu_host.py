@@ -16,7 +16,7 @@ from envhub_worker.lockdown.mechanisms import kernel
 from tests.attacks.harness import Arena, control_run
 
 PCI = "/sys/devices/pci0000:00"
-_ORDINARY = ("null", "zero", "full", "random", "urandom", "shm", "ptmx", "pts", "fd")
+_ORDINARY = ("null", "zero", "full", "random", "urandom", "shm", "tty", "ptmx", "pts", "fd")
 FOLDERS = ("/sys/class/net", "/sys/devices", PCI, "/sys/bus/pci/devices", "/sys/class/drm", "/dev")
 MISSING = 9
 

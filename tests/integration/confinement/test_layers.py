@@ -159,7 +159,7 @@ result = {
     seen = cells["strict"].run(source)["result"]
     assert {"passwd", "group", "hosts"} <= set(seen["etc"])
     assert not {"shadow", "ssh", "sudoers", "machine-id"} & set(seen["etc"])
-    nodes = {"null", "full", "random", "urandom"}
+    nodes = {"null", "full", "random", "urandom", "tty"}
     assert set(seen["dev"]) == nodes | {"fd", "stdin", "stdout", "stderr", "shm", "pts", "ptmx"}
     assert seen["net"] == ["lo"]
     assert max(seen["pids"]) < 100

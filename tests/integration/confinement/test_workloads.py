@@ -229,7 +229,7 @@ def test_a_program_has_a_terminal_of_the_jails_own(strict: Cell) -> None:
 import os, pty
 before = sorted(os.listdir("/dev/pts"))
 pid, fd = pty.fork()
-if not pid: os.execv("/bin/sh", ["sh", "-c", "tty; test -t 1 && echo to it"])
+if not pid: os.execv("/bin/sh", ["sh", "-c", "tty; test -t 1 && echo to it >/dev/tty"])
 said = b""
 try:
     while piece := os.read(fd, 100): said += piece

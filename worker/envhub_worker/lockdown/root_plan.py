@@ -32,7 +32,9 @@ _NETWORK_FOLDERS = ("/etc/ssl", "/etc/pki", "/etc/ca-certificates")
 _SYS_FOLDERS = ("/sys/devices/system/cpu", "/sys/devices/system/node")
 # /dev/zero is missing under every policy: a mapping of it is shared memory that can be hidden from
 # init (see the filter). No driver is known to need it.
-_DEVICES = ("/dev/null", "/dev/full", "/dev/random", "/dev/urandom")
+# /dev/tty is the terminal that a process has got in its jail: the zygote and each runner lead
+# sessions of their own, which have none.
+_DEVICES = ("/dev/null", "/dev/full", "/dev/random", "/dev/urandom", "/dev/tty")
 
 _TEXTS = {
     "/etc/passwd": f"sandbox:x:{INSIDE_UID}:{INSIDE_UID}:sandbox:{HOME}:/bin/sh\n"

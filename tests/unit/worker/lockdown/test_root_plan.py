@@ -48,7 +48,7 @@ def test_root_without_wishes_is_the_system_only() -> None:
     plan = root()
     assert plan.trees == ("/etc/fonts", "/sys/devices/system/cpu", "/usr")
     assert plan.copies == ("/etc/ld.so.cache",)
-    assert plan.devices == ("/dev/null", "/dev/full", "/dev/random", "/dev/urandom")
+    assert plan.devices == ("/dev/null", "/dev/full", "/dev/random", "/dev/urandom", "/dev/tty")
     assert (plan.links["/bin"], plan.links["/lib"]) == ("usr/bin", "usr/lib")
     assert plan.links["/dev/fd"] == "/proc/self/fd"
     assert set(plan.texts) == {"/etc/passwd", "/etc/group", "/etc/nsswitch.conf", "/etc/hosts"}
