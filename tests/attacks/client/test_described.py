@@ -120,7 +120,8 @@ def test_the_control_takes_the_memory() -> None:
 
 
 def test_described_specs_make_nothing(liar: LyingServer, folder: str, tmp_path: Path) -> None:
-    """Of a spec only facts are taken; the control makes the whole of it, and a command runs."""
+    """Of a spec only facts are taken; the control makes the whole of it, and a command runs. One
+    whose id ``gym.make`` would import, which stands before a colon, is only told."""
     canary = tmp_path / "made"
     liar.lies[m.Call] = relayed(frames_of(Lie(SPEC, spec_of(canary))))
     with started(liar, folder) as env:
@@ -128,6 +129,8 @@ def test_described_specs_make_nothing(liar: LyingServer, folder: str, tmp_path: 
         assert (spec.id, spec.max_episode_steps) == ("Trap-v0", 7)
         with pytest.raises(gym.error.Error, match="sandbox"):
             gym.make(spec)
+        liar.lies[m.Call] = relayed(frames_of(Lie(SPEC, {"id": "antigravity:Trap-v0"})))
+        assert not hasattr(env.get_attr("spec")[0], "id")
     assert not canary.exists()
     with pytest.raises(Exception):  # noqa: B017,PT011  # what it returns is no environment
         gym.make(EnvSpec(**spec_of(canary)))
@@ -160,10 +163,3 @@ def test_numbers_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 1 <= kept() <= space_copies.MAX_BYTES >> 20
     monkeypatch.setattr(space_copies, "MAX_BYTES", 1 << 40)
     assert kept() == 100, "the control failed: it keeps what it may"
-
-
-def test_described_ids_import_nothing(liar: LyingServer, folder: str) -> None:
-    """``gym.make(spec.id)`` imports what stands before a colon: such a spec is only told."""
-    liar.lies[m.Call] = relayed(frames_of(Lie(SPEC, {"id": "antigravity:Trap-v0"})))
-    with started(liar, folder) as env:
-        assert not hasattr(env.get_attr("spec")[0], "id")

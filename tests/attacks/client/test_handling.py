@@ -54,6 +54,9 @@ ERRORS = [
 ]
 
 
+RESET_ERRORS = [KeyError("k"), MemoryError()]
+
+
 @pytest.fixture
 def other(tmp_path: Path) -> Iterator[Any]:
     repository = str(write_repository(tmp_path / "other", f"# other {tmp_path}"))
@@ -80,40 +83,28 @@ def raising_here(error: BaseException, otherwise: Callable[..., Any]) -> Callabl
     return fail
 
 
-ANSWERED: dict[str, Callable[[Any], object]] = {
-    "step": lambda env: env.step(ACTIONS),
-    "reset": lambda env: env.reset(),
-}
-
-
-@pytest.mark.parametrize(
-    ("operation", "error"),
-    [*(("step", error) for error in ERRORS), ("reset", KeyError("k")), ("reset", MemoryError())],
-    ids=lambda one: one if isinstance(one, str) else type(one).__name__,
-)
 def test_what_handling_raises_is_the_workers_fault(
-    liar: LyingServer,
-    folder: str,
-    other: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    error: Exception,
-    operation: str,
+    liar: LyingServer, folder: str, other: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is told as such, printable and with the place; that jail ends, the others go on."""
-    with started(liar, folder, policy={"restart": "on_reset"}) as env:
-        with monkeypatch.context() as patched:
-            patched.setattr(results.batches, "conforms", raising(error))
-            with pytest.raises(RemoteProtocolError) as caught:
-                ANSWERED[operation](env)
-        assert caught.value.__cause__ is error
-        assert isinstance(caught.value, MessageTooLargeError) == isinstance(error, MemoryError)
-        assert str(caught.value).isprintable()
-        assert any(isinstance(asked, m.CloseJail) for asked in liar.asked)
-        with pytest.raises(WorkerDiedError):
+    policy = {"restart": "on_reset", "restart_backoff_s": 0, "restart_budget": len(ERRORS) + 2}
+    with started(liar, folder, policy=policy) as env:
+        for error in (*ERRORS, *RESET_ERRORS):
+            ask = env.reset if error in RESET_ERRORS else lambda: env.step(ACTIONS)
+            closed = sum(isinstance(asked, m.CloseJail) for asked in liar.asked)
+            with monkeypatch.context() as patched:
+                patched.setattr(results.batches, "conforms", raising(error))
+                with pytest.raises(RemoteProtocolError) as caught:
+                    ask()
+            assert caught.value.__cause__ is error
+            assert isinstance(caught.value, MessageTooLargeError) == isinstance(error, MemoryError)
+            assert str(caught.value).isprintable()
+            assert sum(isinstance(asked, m.CloseJail) for asked in liar.asked) > closed, error
+            with pytest.raises(WorkerDiedError):
+                env.step(ACTIONS)
+            other.step(ACTIONS)
+            env.reset()
             env.step(ACTIONS)
-        other.step(ACTIONS)
-        env.reset()
-        env.step(ACTIONS)
 
 
 @pytest.mark.parametrize("error", [KeyError("k"), MemoryError(), StopIteration()], ids=repr)
@@ -204,24 +195,6 @@ def test_runners_without_numbers_are_refused(liar: LyingServer, folder: str, wha
     liar.lies[m.OpenJail] = lambda asked: [asked.answer(m.JailOpened(1, RUNNERS[what], ()))]
     with pytest.raises(RemoteProtocolError):
         opened(liar, folder)
-
-
-@pytest.mark.parametrize("parts", [1, 2, 3])
-def test_as_many_answers_as_runners(liar: LyingServer, folder: str, parts: int) -> None:
-    frames = m.pack(step_done())
-
-    def lie(asked: Asked) -> list[Frames]:
-        return [
-            [*m.pack_header(m.RelayDone((len(frames),) * parts), asked.request_id), *frames * parts]
-        ]
-
-    liar.lies[m.Step] = lie
-    with started(liar, folder) as env:
-        if parts == 1:
-            env.step(ACTIONS)
-        else:
-            with pytest.raises(RemoteProtocolError):
-                env.step(ACTIONS)
 
 
 GRAPHS = spaces.Dict({"g": spaces.Graph(spaces.Box(0, 1, (2,)), None), "x": spaces.Discrete(2)})

@@ -106,6 +106,11 @@ class Forwarding(VectorWrapper):
         return getattr(self.env, name)
 
 
+WRAPS: list[Callable[[Any], Any]] = [
+    *(lambda env: env, VectorWrapper, Forwarding, lambda env: env.envs[0])
+]
+
+
 def asked_for(liar: LyingServer) -> set[str]:
     kinds = (m.GetOwn, m.CallOwn, m.Call, m.GetOne, m.CallOne)
     return {request.name for request in liar.asked if isinstance(request, kinds)}
@@ -114,22 +119,14 @@ def asked_for(liar: LyingServer) -> set[str]:
 # --- copying --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("wrap", [lambda env: env, VectorWrapper, Forwarding, lambda e: e.envs[0]])
-def test_deepcopy_hands_no_more(liar: LyingServer, folder: str, wrap: Callable[[Any], Any]) -> None:
+def test_copies_are_fresh_and_hand_no_more(liar: LyingServer, folder: str) -> None:
     """Copying a config that holds an environment does not send the rest of it to the jail."""
     with greedy(liar, folder) as suites:
-        copied = copy.deepcopy([TOKEN, wrap(suites.env)])
-        assert type(copied[1]) is type(wrap(suites.env))
-        assert copied[1] is not suites.env
-        assert not asked_for(liar)
-        assert TOKEN.encode() not in liar.heard
-        copy.deepcopy([TOKEN, Naive(suites.env, "__deepcopy__")])
-        assert TOKEN.encode() in liar.heard, "the control failed: a naive proxy hands it over"
-
-
-def test_copies_and_pickles_are_fresh_environments(liar: LyingServer, folder: str) -> None:
-    with greedy(liar, folder) as suites:
         env = suites.env
+        for wrap in WRAPS:
+            copied = copy.deepcopy([TOKEN, wrap(env)])
+            assert type(copied[1]) is type(wrap(env))
+            assert copied[1] is not env
         for made in (copy.copy(env), copy.deepcopy(env)):
             assert type(made) is type(env)
             assert made is not env
@@ -139,6 +136,9 @@ def test_copies_and_pickles_are_fresh_environments(liar: LyingServer, folder: st
             assert many.env is not env
             many.close()
         assert not asked_for(liar)
+        assert TOKEN.encode() not in liar.heard
+        copy.deepcopy([TOKEN, Naive(env, "__deepcopy__")])
+        assert TOKEN.encode() in liar.heard, "the control failed: a naive proxy hands it over"
 
 
 # --- arrays ---------------------------------------------------------------------------------
@@ -159,22 +159,19 @@ def of_torch() -> list[Callable[[Any], object]]:
     return []
 
 
-@pytest.mark.parametrize("wrap", [lambda env: env, Forwarding, lambda env: env.envs[0]])
-def test_numpy_reads_and_writes_no_memory(
-    liar: LyingServer, folder: str, wrap: Callable[[Any], Any]
-) -> None:
+def test_numpy_reads_and_writes_no_memory(liar: LyingServer, folder: str) -> None:
     """An environment is one object to numpy, wherever the worker says that its array lies."""
     memory = ctypes.create_string_buffer(TOKEN.encode())
     with greedy(liar, folder, interface_of(memory)) as suites:
-        env = wrap(suites.env)
-        for made in (np.asarray(env), np.array([env], object)):
-            assert made.dtype == object
-            assert made.item() is env
-        with pytest.raises(TypeError):
-            np.asarray(env, np.float32)
-        for convert in (np.from_dlpack, memoryview, bytes, bytearray, *of_torch()):
-            with pytest.raises((TypeError, RuntimeError, AttributeError)):
-                convert(env)
+        for env in (wrap(suites.env) for wrap in WRAPS):
+            for made in (np.asarray(env), np.array([env], object)):
+                assert made.dtype == object
+                assert made.item() is env
+            with pytest.raises(TypeError):
+                np.asarray(env, np.float32)
+            for convert in (np.from_dlpack, memoryview, bytes, bytearray, *of_torch()):
+                with pytest.raises((TypeError, RuntimeError, AttributeError)):
+                    convert(env)
         assert not asked_for(liar)
 
         stolen = np.asarray(Naive(suites.env, "__array_interface__"))
@@ -201,28 +198,20 @@ def templated(thing: Any) -> str:
     return str(thing.__html__()) if hasattr(thing, "__html__") else html.escape(str(thing))
 
 
-@pytest.mark.parametrize("wrap", [lambda env: env, VectorWrapper, Forwarding, lambda e: e.envs[0]])
-def test_notebooks_show_the_clients_own_text(
-    liar: LyingServer, folder: str, wrap: Callable[[Any], Any]
-) -> None:
-    with greedy(liar, folder) as suites:
-        env = wrap(suites.env)
-        own = getattr(env, HTML)() if isinstance(env, SandboxVectorEnv) else ""
-        assert SCRIPT not in own + templated(env)
-        assert SCRIPT not in "".join(displayed(env).values())
-        assert not asked_for(liar)
-        naive = Naive(suites.env, "__html__", "_repr_html_")
-        assert SCRIPT in templated(naive), "the control shows nothing"
-        assert SCRIPT in displayed(naive).get("text/html", ""), "the control shows nothing"
-
-
-def test_suites_show_the_clients_own_text(liar: LyingServer, folder: str) -> None:
-    """Its names are escaped where they are shown as HTML, and nobody is asked for them."""
+def test_notebooks_show_the_clients_own_text(liar: LyingServer, folder: str) -> None:
+    """Of suites, too: their names are escaped in HTML, and nobody is asked for them."""
     with greedy(liar, folder, suite=SCRIPT) as suites:
+        for env in (wrap(suites.env) for wrap in WRAPS):
+            own = getattr(env, HTML)() if isinstance(env, SandboxVectorEnv) else ""
+            assert SCRIPT not in own + templated(env)
+            assert SCRIPT not in "".join(displayed(env).values())
         shown = displayed(suites)["text/html"]
         assert SCRIPT not in templated(suites) + shown
         assert html.escape(SCRIPT) in shown, "the control shows no suite"
         assert not asked_for(liar)
+        naive = Naive(suites.env, "__html__", "_repr_html_")
+        assert SCRIPT in templated(naive), "the control shows nothing"
+        assert SCRIPT in displayed(naive).get("text/html", ""), "the control shows nothing"
 
 
 # --- every name -----------------------------------------------------------------------------

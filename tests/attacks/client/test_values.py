@@ -174,14 +174,13 @@ print(any(int(start, 16) <= address < int(end, 16) for start, end in maps))
 """
 
 
-def test_the_control_crashes_on_an_index() -> None:
-    done = subprocess.run([sys.executable, "-c", CRASH], capture_output=True, check=False)
-    assert done.returncode == -signal.SIGSEGV
-
-
-def test_the_control_draws_memory() -> None:
-    done = subprocess.run([sys.executable, "-c", LEAK], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "True"
+def test_the_control_crashes_on_an_index_and_draws_memory() -> None:
+    crashed, drew = (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+        for code in (CRASH, LEAK)
+    )
+    assert crashed.returncode == -signal.SIGSEGV
+    assert drew.stdout.strip() == "True"
 
 
 @pytest.mark.parametrize("lie", [np.zeros(3), "1", 1.5, {"a": 1}, [1], (None, b"1")], ids=repr)
