@@ -143,15 +143,6 @@ def test_attributes_and_methods_of_one(make: Callable[..., Any]) -> None:
     assert_same(ask(expected), ask(actual), "answers")
 
 
-def test_looking_at_a_method_runs_nothing(make: Callable[..., Any]) -> None:
-    env = make(told(2))
-    env.reset(seed=0)
-    for one in env.envs:
-        for name in ("reset", "step", "close", "render", "add"):
-            assert callable(getattr(one.unwrapped, name))
-    assert env.get_attr("ran") == (["reset"], ["reset"])
-
-
 def test_spaces_specs_and_generators_are_themselves(make: Callable[..., Any]) -> None:
     """By ``get_attr``, of one, and in infos; a spec has its facts, and makes nothing."""
     env_fns = [partial(gym.make, "CartPole-v1", max_episode_steps=5 + i) for i in range(2)]
@@ -224,8 +215,13 @@ def test_a_space_is_one_object_however_it_is_read(make: Callable[..., Any]) -> N
 
 
 def test_one_is_not_closed_under_the_others(make: Callable[..., Any]) -> None:
+    """Looking at a method runs nothing."""
     env = make(told(2))
     env.reset(seed=0)
+    for one in env.envs:
+        for name in ("reset", "step", "close", "render", "add"):
+            assert callable(getattr(one.unwrapped, name))
+    assert env.get_attr("ran") == (["reset"], ["reset"])
     with pytest.raises(ValueError, match="close the vector environment"):
         env.envs[0].close()
     env.step(np.zeros(2, np.int64))
@@ -259,12 +255,16 @@ def test_a_vector_environment_without_sub_environments_says_so() -> None:
 
 
 def test_stand_ins_say_what_to_ask_instead() -> None:
-    """What has no form of its own is a text, and its AttributeError names the way to its parts."""
+    """What has no form of its own is a text, and its AttributeError names the way to its parts. So
+    does what stands for the functions, of which there are as many as in ``SyncVectorEnv``."""
     env = vector([partial(Holding, object())] * 2)
     found = env.get_attr("held")[0]
     assert isinstance(found, RemoteObject)
     with pytest.raises(AttributeError, match=r"description of a .*get_attr"):
         found.part  # noqa: B018
+    assert len(env.env_fns) == len(SyncVectorEnv(told(2)).env_fns)
+    with pytest.raises(gym.error.Error, match="in a sandbox"):
+        env.env_fns[0]()
     env.close()
 
 
@@ -289,12 +289,3 @@ def test_names_are_strings(name: Any) -> None:
         assert texts[0] == texts[1]
     actual.reset(seed=0)
     actual.close()
-
-
-def test_the_functions_are_elsewhere() -> None:
-    """There are as many as in ``SyncVectorEnv``; what stands for them says where they are."""
-    env = vector(told(3))
-    assert len(env.env_fns) == len(SyncVectorEnv(told(3)).env_fns)
-    with pytest.raises(gym.error.Error, match="in a sandbox"):
-        env.env_fns[0]()
-    env.close()

@@ -116,19 +116,6 @@ def test_a_bundle_holds_what_is_promised(tmp_path: Path) -> None:
     assert bundle.load.env_kwargs == {"ending": "exit", "actions": "array"}
 
 
-def test_an_older_reset_is_forgotten_and_a_new_jail_begins_anew(tmp_path: Path) -> None:
-    with brittle(tmp_path, policy={"restart": "on_reset", "restart_backoff_s": 0}) as suites:
-        env = suites.env
-        env.set_attr("weight", 3.0)
-        env.reset(seed=1)
-        first = play(env)
-        env.reset(seed=2)
-        second = play(env)
-    assert first.bundle != second.bundle
-    bundle = load_bundle(Path(str(second.bundle)))
-    assert [type(one).__name__ for one in bundle.requests()][:2] == ["Reset", "Step"]
-
-
 def test_a_mended_repository_survives(tmp_path: Path) -> None:
     """The file is named that has changed, and the exit code says that nothing died."""
     repository = tmp_path / "repository"
@@ -178,32 +165,32 @@ def test_the_last_requests_alone_end_in_another_way(tmp_path: Path) -> None:
 
 
 def test_no_bundle_where_none_is_wanted(tmp_path: Path) -> None:
-    with brittle(tmp_path, policy={"crash_history": 0}) as suites:
-        suites.env.reset(seed=1)
-        error = play(suites.env)
-    assert (error.bundle, "envhub replay" in str(error)) == (None, False)
+    """Nor where none can be written; the death is told all the same."""
+    (tmp_path / "taken").write_text("a file")
+    for folder, history in ((tmp_path, 0), (tmp_path / "taken", 100)):
+        with brittle(folder, policy={"crash_history": history}) as suites:
+            suites.env.reset(seed=1)
+            error = play(suites.env)
+        assert (error.exit_code, error.bundle, "envhub replay" in str(error)) == (9, None, False)
     with brittle(tmp_path) as suites:
         suites.env.reset(seed=1)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_death_is_told_although_no_bundle_can_be_written(tmp_path: Path) -> None:
-    (tmp_path / "taken").write_text("a file")
-    with brittle(tmp_path / "taken") as suites:
-        suites.env.reset(seed=1)
-        error = play(suites.env)
-    assert (error.exit_code, error.bundle) == (9, None)
+    assert list(tmp_path.iterdir()) == [tmp_path / "taken"]
 
 
 def test_the_oldest_bundles_give_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is no bundle stays. An older reset is forgotten, and a new jail begins anew."""
     monkeypatch.setattr(bundle_writer, "KEPT", 2)
     (tmp_path / "mine").mkdir()
     policy = {"restart": "on_reset", "restart_backoff_s": 0}
     with brittle(tmp_path, policy=policy) as suites:
+        suites.env.set_attr("weight", 3.0)
         bundles = []
         for seed in range(4):
             suites.env.reset(seed=seed)
             bundles.append(str(play(suites.env).bundle))
+    assert len(set(bundles)) == 4
+    requests = load_bundle(Path(bundles[-1])).requests()
+    assert [type(one).__name__ for one in requests][:2] == ["Reset", "Step"]
     assert (tmp_path / "mine").is_dir()
     left = {str(path) for path in tmp_path.iterdir()} - {str(tmp_path / "mine")}
     assert (len(left), bundles[-1] in left, left <= set(bundles)) == (2, True, True)

@@ -235,7 +235,8 @@ def test_rewards_of_different_shapes_are_not_joined() -> None:
 def test_another_space_is_refused_before_the_first_step(
     liar: LyingServer, honest: LyingServer, folder: str
 ) -> None:
-    """All workers have the spaces that the first one has described, or none is used."""
+    """All workers have the spaces that the first one has described, and no more rows than they were
+    built for, or none is used."""
     other = spaces.Box(-1, 1, (4,), np.float32)
     built = env_manifest(single_observation_space=other)
     honest.lies[m.Build] = relayed(m.BuildDone(encode_env(built)))
@@ -245,11 +246,6 @@ def test_another_space_is_refused_before_the_first_step(
     del honest.lies[m.Build]
     with fleet(liar, honest, folder):  # the control
         pass
-
-
-def test_more_rows_are_refused_before_the_first_step(
-    liar: LyingServer, honest: LyingServer, folder: str
-) -> None:
     built = wire.env_manifest(OBSERVATION, ACTION, ALL, sync=True)
     liar.lies[m.Build] = relayed(m.BuildDone(encode_env(built)))
     with pytest.raises(errors.EnvHubError), fleet(liar, honest, folder):

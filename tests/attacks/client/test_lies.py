@@ -53,14 +53,6 @@ from tests.support import inside
 from tests.support.repositories import CARTPOLES, write_repository
 from tests.support.wire import decode_space, deep, ext, packed, value
 
-
-@pytest.mark.short
-def test_canary_sings(tmp_path: Path) -> None:
-    """The control: loading the pickle executes it."""
-    pickle.loads(cloudpickle.dumps(Canary(tmp_path / "executed")))
-    assert (tmp_path / "executed").exists()
-
-
 PLACES: dict[str, Callable[[Any], m.Message]] = {
     "observation": lambda evil: step_done(observation=evil),
     "in an observation": lambda evil: step_done(observation={"a": (evil,)}),
@@ -118,8 +110,10 @@ def test_pickles_in_manifests_are_never_loaded(
     assert not canary.exists()
 
 
+@pytest.mark.short
 def test_pickle_for_a_reply_is_never_loaded(liar: LyingServer, folder: str, tmp_path: Path) -> None:
-    """Nor is one that comes instead of a message, as frames of older protocols did."""
+    """Nor is one that comes instead of a message, as frames of older protocols did. The control:
+    loading it executes it."""
     canary = tmp_path / "executed"
     data = cloudpickle.dumps(Canary(canary))
     liar.lies[m.Step] = lambda asked: [[data]]
@@ -128,6 +122,8 @@ def test_pickle_for_a_reply_is_never_loaded(liar: LyingServer, folder: str, tmp_
         refuses(suites.env.reset)
         refuses(lambda: suites.env.step(ACTIONS))
     assert not canary.exists()
+    pickle.loads(data)
+    assert canary.exists()
 
 
 WRONG: dict[str, dict[str, Any]] = {
@@ -193,11 +189,6 @@ def wide(number: int) -> dict[str, Any]:
     return box(shape=(WIDE,), low=np.array(-number, np.float32))
 
 
-def test_a_wide_box_is_accepted() -> None:
-    """The control: one of those that are too many together."""
-    assert decode_space(wide(1), max_elements=ELEMENTS).shape == (WIDE,)
-
-
 # some: test_manifest and test_spaces have all that a description may be
 MANIFESTS: dict[str, Callable[[], dict[str, Any]]] = {
     "absurdly many sub-environments": lambda: changed(num_envs=2**40),
@@ -219,7 +210,9 @@ MANIFESTS: dict[str, Callable[[], dict[str, Any]]] = {
 
 @pytest.mark.parametrize("what", list(MANIFESTS))
 def test_lying_manifests_are_refused(liar: LyingServer, folder: str, what: str) -> None:
-    """A description that cannot be true, or is absurdly large, is refused before it is built."""
+    """A description that cannot be true, or is absurdly large, is refused before it is built. The
+    control: one of those that are too many together."""
+    assert decode_space(wide(1), max_elements=ELEMENTS).shape == (WIDE,)
     liar.lies[m.Load] = relayed(described(MANIFESTS[what]()))
     limits = {"elements": ELEMENTS}
     refuses(lambda: opened(liar, folder, policy={"limits": limits}))
@@ -241,19 +234,15 @@ OTHERS: dict[str, tuple[type[m.Message], m.Message]] = {
 
 @pytest.mark.parametrize("what", list(OTHERS))
 def test_another_environment_is_refused(liar: LyingServer, folder: str, what: str) -> None:
-    """Whichever way it shows that what a jail holds is not what the manifest says."""
+    """Whichever way it shows that what a jail holds is not what the manifest says. The control:
+    the honest answers."""
     opened(liar, folder).close()
+    with started(liar, folder):
+        pass
     asked, answer = OTHERS[what]
     liar.lies[asked] = relayed(answer)
     with opened(liar, folder) as suites:
         refuses(suites.env.reset)
-
-
-def test_what_is_remembered_is_not(liar: LyingServer, folder: str) -> None:
-    """The control: the honest answers."""
-    opened(liar, folder).close()
-    with started(liar, folder):
-        pass
 
 
 DISAGREEING: dict[str, dict[str, Any]] = {

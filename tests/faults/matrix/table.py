@@ -1,5 +1,5 @@
 """The fault matrix: what goes wrong, when, and what the user is then promised to see.
-``test_matrix.py`` tries every row; ``docs/internals/faults-tried.md`` is written from them."""
+``test_matrix.py`` tries every row; ``docs/faults.md`` explains what to do."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

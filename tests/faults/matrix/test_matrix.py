@@ -14,7 +14,6 @@ import pytest
 
 from envhub_sandbox import Limits, Timeouts, errors, make_env
 from tests.faults.conftest import Neighbour
-from tests.faults.matrix.document import DOCUMENT, document
 from tests.faults.matrix.table import CLOSED, LOADING, RESET, ROWS, USABLE, Cell, Row, cells
 from tests.faults.remains.traces import Traces
 from tests.support import inside
@@ -27,7 +26,6 @@ _WAIT_S = 60.0
 #: A generous bound on everything that must be noticed, and not be waited for.
 BOUND_S = 120.0
 _FULL = os.environ.get("ENVHUB_FAULTS") == "full"
-_MEASURED = os.environ.get("ENVHUB_FAULTS_MEASURED")
 
 
 @pytest.mark.parametrize("cell", [pytest.param(cell, id=cell.name) for cell in cells(_FULL)])
@@ -37,13 +35,12 @@ def test_fault_is_told_contained_and_cleaned_up(
     """The user sees what the table says, in bounded time; siblings go on; nothing remains."""
     base = Traces.of(place)
     with contextlib.ExitStack() as stack:
-        seconds = _try(cell, neighbour, _repository(cell.row, tmp_path), stack)
+        _try(cell, neighbour, _repository(cell.row, tmp_path), stack)
     gc.collect()
     assert eventually(lambda: not Traces.of(place).beyond(base)), Traces.of(place).beyond(base)
-    _write_down(cell, seconds)
 
 
-def _try(cell: Cell, neighbour: Neighbour, repository: Path, stack: contextlib.ExitStack) -> float:
+def _try(cell: Cell, neighbour: Neighbour, repository: Path, stack: contextlib.ExitStack) -> None:
     if cell.row.moment in LOADING:
         error, seconds = _caught(lambda: _use(_make(cell, repository)))
         suites = None
@@ -55,7 +52,6 @@ def _try(cell: Cell, neighbour: Neighbour, repository: Path, stack: contextlib.E
     assert neighbour.goes_on()
     if suites is not None:
         _check_what_becomes_of_it(cell, suites)
-    return seconds
 
 
 def _repository(row: Row, folder: Path) -> Path:
@@ -189,18 +185,8 @@ def _check_what_becomes_of_it(cell: Cell, suites: Any) -> None:
     assert env.step([0, 0])[0].tolist() == [[1.0], [1.0]]
 
 
-def _write_down(cell: Cell, seconds: float) -> None:
-    if _MEASURED:
-        with open(_MEASURED, "a") as file:
-            file.write(json.dumps([cell.name, round(seconds, 2)]) + "\n")
-
-
 def test_every_moment_and_fault_is_in_the_table() -> None:
     from tests.faults.matrix.table import FAULTS, MOMENTS
 
     assert {row.fault for row in ROWS} == set(FAULTS)
     assert {row.moment for row in ROWS} == set(MOMENTS)
-
-
-def test_document_is_written_from_the_table() -> None:
-    assert DOCUMENT.read_text() == document()

@@ -1,11 +1,14 @@
-"""A folder is judged as its commit is: the same files and findings, and the same code runs."""
+"""A folder is judged as its commit is: the same files and findings, and the same code runs. Of a
+list, each is."""
 
+import json
 import py_compile
 import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 
@@ -15,6 +18,7 @@ from envhub_sandbox.extras.judge.findings import Report
 from envhub_sandbox.extras.judge.judge import judge
 from envhub_sandbox.extras.judge.settings import JudgeOptions
 from envhub_sandbox.hub.snapshot import snapshot_named
+from tests.corpus.entries import Entry
 from tests.hub.olah_server import GitRepository, OlahServer
 from tests.support.command_line import envhub
 from tests.support.repositories import STILL
@@ -121,3 +125,36 @@ def test_a_folder_is_judged_as_its_commit(
         failing = {one.file for one in report.failures(Severity.ERROR)}
         tag = sys.implementation.cache_tag
         assert failing == {f"__pycache__/beside.{tag}.pyc", "without_source.pyc"}
+
+
+_QUICK = ("--steps", "4", "--resets", "0", "--n-envs", "1", "--memory", "1G")
+_HONEST = Entry(group="honest")
+_BROKEN = Entry(group="broken", env="def step(self, action):\n    raise RuntimeError('it broke')")
+
+
+def test_each_of_a_list_is_judged(tmp_path: Path) -> None:
+    """In its order, and told with what fails first; files beside it that say otherwise are none."""
+    _HONEST.write(tmp_path / "honest")
+    _BROKEN.write(tmp_path / "broken")
+    (tmp_path / "empty").mkdir()
+    forged = {"counts": {"passed": 3}, "results": []}
+    (tmp_path / "index.json").write_text(json.dumps(forged))
+    names = [str(tmp_path / name) for name in ("honest", "broken", "empty")]
+    (tmp_path / "list").write_text("\n".join(["# ours", *names]))
+    junit = tmp_path / "junit.xml"
+    done = envhub("check", "--all", tmp_path / "list", "--json", "--junit", junit, *_QUICK, code=1)
+    document = json.loads(done.stdout)
+    assert document["counts"] == {"failed": 1, "not judged": 1, "passed": 1}
+    failed, empty, honest = document["results"]
+    assert [row["line"] for row in (failed, empty, honest)] == [3, 4, 2]
+    [why] = failed["why"]
+    assert re.fullmatch(r"runs: env\.py:\d+: RuntimeError: it broke", why)
+    assert failed["report"]["passed"] is False
+    assert honest["report"]["passed"] is True
+    assert empty["report"] is None
+    assert "no file 'env.py'" in empty["why"][0]
+    said = [line.split("]")[1].split()[0] for line in done.stderr.splitlines() if "[" in line]
+    assert said == ["passed", "failed", "not"]
+    suites = ElementTree.parse(junit).getroot()
+    assert [suite.attrib["failures"] for suite in suites] == ["1", "0", "0"]
+    assert [suite.attrib["errors"] for suite in suites] == ["0", "1", "0"]

@@ -132,7 +132,12 @@ def environment(index: Index, tmp_path: Path) -> str:
     return Path(made["folder"]).name
 
 
-def test_environments_are_listed(environment: str) -> None:
+def test_environments_of_packages_come_and_go(
+    index: Index, environment: str, tmp_path: Path
+) -> None:
+    """They are listed. One in use is kept: named, that is an error which says by whom; among
+    others, a line. Newer versions are chosen if asked, and the next ``make_env`` has them, too.
+    They are removed by name, and those not used; what was left half-made goes as well."""
     [found] = document("cache", "list")["environments"]
     assert (found["name"], found["bytes"] > 0) == (environment, True)
     assert "wanted==1.0" in found["packages"]
@@ -140,37 +145,29 @@ def test_environments_are_listed(environment: str) -> None:
     assert environment[:12] in done.stdout
     assert "1 snapshot, 1 environment" in done.stderr
 
-
-def test_environments_are_removed(environment: str) -> None:
-    """By name, and not those that were used; what was left half-made goes as well."""
-    half = environments.root() / ".building-0-x"
-    half.mkdir()
-    used = time.time() - 86400 * 3
-    os.utime(environments.root() / environment / "environment.json", (used, used))
-    assert "0 environments" in envhub("cache", "remove", "--unused-for", "4").stderr
-    assert "1 environment" in envhub("cache", "remove", environment[:9]).stderr
-    assert (environments.every(), half.exists()) == ([], False)
-
-
-def test_environments_in_use_are_kept(environment: str) -> None:
-    """Named, that is an error which says by whom; among others, a line."""
     lock = SharedLock(environments.root() / environment / RECORD)
-    user = f"{environment[:12]} is in use by process {os.getpid()}"
     named = envhub("cache", "remove", environment[:9], code=2)
     swept = envhub("cache", "remove", "--unused-for", "0", code=0)
     assert "0 environments" in swept.stderr
     for told in (named, swept):
+        user = f"{environment[:12]} is in use by process {os.getpid()}"
         assert user in " ".join(told.stderr.split())
     assert len(environments.every()) == 1
     lock.release()
 
-
-def test_newer_versions_are_chosen_if_asked(index: Index, environment: str, tmp_path: Path) -> None:
-    """And then the next ``make_env`` has them, too."""
     make_wheel(index.folder, "wanted", "2.0")
     asked = ("inspect", "--download", tmp_path / "repo")
     assert Path(document(*asked)["environment"]["folder"]).name == environment
     assert "wanted==2.0" in document(*asked, "--upgrade")["environment"]["packages"]
+
+    half = environments.root() / ".building-0-x"
+    half.mkdir()
+    used = time.time() - 86400 * 3
+    for record in environments.root().glob(f"[!.]*/{RECORD}"):
+        os.utime(record, (used, used))
+    assert "0 environments" in envhub("cache", "remove", "--unused-for", "4").stderr
+    assert "1 environment" in envhub("cache", "remove", environment[:9]).stderr
+    assert (len(environments.every()), half.exists()) == (1, False)
 
 
 def test_a_repository_that_needs_nothing_is_only_downloaded(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def fail_with(monkeypatch: pytest.MonkeyPatch, errors: dict[str, Exception]) -> 
 
 
 def test_what_is_missing_comes_with_its_fix(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the words of the layer, escaped, with the exit code for it."""
+    """In the words of the layer, escaped, with the exit code of the chosen profile."""
     text = "this host cannot enforce user-namespace: \x1b[2J\nsysctl -w x=1"
     fail_with(monkeypatch, {"strict": SandboxUnavailableError(text)})
     told = envhub("doctor", code=6).stdout
@@ -82,9 +82,6 @@ def test_what_is_missing_comes_with_its_fix(monkeypatch: pytest.MonkeyPatch) -> 
     assert "  this host cannot enforce user-namespace: \\x1b[2J\n  sysctl -w x=1\n" in told
     assert "no-userns, container: not available here\n  not this either\n" in told
     assert told.count("not this either") == 1, "those with the same reason share it"
-
-
-def test_the_chosen_profile_decides(monkeypatch: pytest.MonkeyPatch) -> None:
     fail_with(monkeypatch, {"container": WorkerStartupError("it did not come up")})
     for profile, code in (("container", 5), ("no-userns", 6)):
         envhub("doctor", "--profile", profile, code=code)

@@ -51,7 +51,8 @@ def cell(request: pytest.FixtureRequest, cells: dict[str, Cell]) -> Cell:
 
 
 def test_no_secret_of_another_jail_is_in_memory() -> None:
-    """What one jail is granted never passes through the zygote that forks the next one."""
+    """What one jail is granted never passes through the zygote that forks the next one; whose
+    snapshot may be named through a link."""
     secret = "hf_" + "Q7w" * 9
     search = """
 import re
@@ -75,12 +76,14 @@ result = found
     granted = replace(confinement, environment={"TOKEN": secret})
     with open_folder() as folder, spawner_in(folder, confinement) as spawner:
         snapshot = make_snapshot(folder)
-        rich, poor = new_cell(spawner, snapshot, granted), None
+        rich = new_cell(spawner, snapshot, granted)
         rich.start()
         assert rich.run("import os; result = len(os.environ['TOKEN'])") == {"result": len(secret)}
         assert rich.run(source)["result"] > 1  # the control: it is in this one
-        poor = new_cell(spawner, snapshot, confinement)
+        (folder / "alias").symlink_to(folder, target_is_directory=True)
+        poor = new_cell(spawner, str(folder / "alias" / "snapshot"), confinement)
         poor.start()
+        assert poor.run("result = open('env.py').read()") == {"result": "VALUE = 7\n"}
         # One copy is the needle that the search itself built.
         assert poor.run(source)["result"] <= 1
 
@@ -139,7 +142,8 @@ def test_strict_root_shows_of_homes_the_way_to_the_interpreter(cells: dict[str, 
 
 @pytest.mark.short
 def test_strict_root_holds_nothing_of_the_host(cells: dict[str, Cell]) -> None:
-    """No secret, mount or process; a loopback device, which is down, and harmless other ones."""
+    """No secret, mount or process; a loopback device, which is down, and harmless other ones. What
+    the kernel counts for the user is forbidden, should the filter let it by, such as watches."""
     source = """
 import os
 result = {
@@ -154,6 +158,8 @@ result = {
     "told": [p for p in ("cmdline", "kallsyms", "interrupts", "partitions", "keys", "diskstats",
                          "sys/kernel/random/boot_id") if open("/proc/" + p).read()],
     "group": open("/proc/self/cgroup").read(),
+    "counted": {open("/proc/sys/user/" + name).read() for name in os.listdir("/proc/sys/user")}
+               == {"0\\n"},
 }
 """
     seen = cells["strict"].run(source)["result"]
@@ -163,10 +169,11 @@ result = {
     assert set(seen["dev"]) == nodes | {"fd", "stdin", "stdout", "stderr", "shm", "pts", "ptmx"}
     assert seen["net"] == ["lo"]
     assert max(seen["pids"]) < 100
-    assert os.getpid() in unconfined(source)["result"]["pids"]
-    assert (seen["there"], seen["writable"], seen["told"]) == ([], [], [])
-    told_outside = unconfined(source)["result"]["told"]
-    assert "sys/kernel/random/boot_id" in told_outside, "the control failed"
+    assert (seen["there"], seen["writable"], seen["told"], seen["counted"]) == ([], [], [], True)
+    outside = unconfined(source)["result"]
+    assert os.getpid() in outside["pids"]
+    assert "sys/kernel/random/boot_id" in outside["told"], "the control failed"
+    assert not outside["counted"]
     assert not re.findall(rf"\b{os.getpid()}\b|\b_{os.getpid()}_", seen["group"])
 
 
@@ -246,18 +253,12 @@ def test_strict_jails_of_one_zygote_share_no_namespace(cells: dict[str, Cell]) -
 
 
 @pytest.mark.short
-def test_strict_forbids_what_the_kernel_counts_for_the_user(cells: dict[str, Cell]) -> None:
-    """Namespaces and watches, should the filter let them by."""
-    names = "os.listdir('/proc/sys/user')"
-    source = f"import os; result = [open('/proc/sys/user/' + n).read() for n in {names}]"
-    assert set(unconfined(source)["result"]) != {"0\n"}
-    assert set(cells["strict"].run(source)["result"]) == {"0\n"}
-
-
-@pytest.mark.short
 def test_capabilities_and_privileges_are_gone(cell: Cell) -> None:
     """As the kernel says it of the runner; an exec brings nothing back. Init has none either.
-    As root, the jail runs as a user that owns and runs nothing; never as uid 0."""
+    As root, the jail runs as a user that owns and runs nothing; never as uid 0. Where the host
+    itself has no memory left, the kernel ends a jail first. The zygote's configuration, with the
+    paths of the server, is not in a runner's command line; outside, its pid is the one that was
+    said."""
     source = """
 import os, subprocess
 with open("/proc/self/status") as status:
@@ -276,34 +277,14 @@ result["uid"] = os.getuid()
     held = Path(f"/proc/{init}/status").read_text().split()
     assert {held[held.index(f"{name}:") + 1] for name in sets} == {"0" * 16}
     assert held[held.index("NoNewPrivs:") + 1] == "1"
+    runner = Path(f"/proc/{cell.wait_for(RunnerStarted).pid}")
     if os.geteuid() == 0:
-        assert os.stat(f"/proc/{cell.wait_for(RunnerStarted).pid}").st_uid > 60000
-
-
-def test_the_kernel_ends_a_jail_before_anything_else_of_the_host(cell: Cell) -> None:
-    """Where the host itself has no memory left."""
-    runner = cell.wait_for(RunnerStarted).pid
-    assert Path(f"/proc/{runner}/oom_score_adj").read_text() == "1000\n"
-
-
-def test_command_line_of_a_runner_tells_nothing(cell: Cell) -> None:
-    """The zygote's configuration, with the paths of the server, is not in it; outside, its pid is
-    the one that was said."""
+        assert runner.stat().st_uid > 60000
+    assert (runner / "oom_score_adj").read_text() == "1000\n"
     arguments = cell.run("result = open('/proc/self/cmdline').read().split(chr(0))")["result"]
-    assert (arguments[1], arguments[3]) == ("-s", "zygote")
+    assert (arguments[1], arguments[3], arguments[5:]) == ("-s", "zygote", [""])
     assert arguments[4].isdigit()
-    assert arguments[5:] == [""]
-    outside = Path(f"/proc/{cell.wait_for(RunnerStarted).pid}/cmdline").read_text()
-    assert "zygote" in outside
-
-
-def test_snapshot_may_be_named_through_a_link() -> None:
-    with open_folder() as folder, spawner_in(folder, Confinement()) as spawner:
-        make_snapshot(folder)
-        (folder / "alias").symlink_to(folder, target_is_directory=True)
-        cell = new_cell(spawner, str(folder / "alias" / "snapshot"), Confinement())
-        cell.start()
-        assert cell.run("result = open('env.py').read()") == {"result": "VALUE = 7\n"}
+    assert "zygote" in (runner / "cmdline").read_text()
 
 
 @pytest.mark.short

@@ -18,8 +18,8 @@ from tests.support.confinement_kit import (
 )
 from tests.support.interpreter import needs, profiles
 
-MEMORY = 300 * MIB
-BOMB = 700 * MIB
+MEMORY = 200 * MIB
+BOMB = 420 * MIB
 HEAP = f"b = bytearray({BOMB}); b[::4096] = b'x' * len(b[::4096]); result = 'filled'"
 SHARED = f"import mmap; m = mmap.mmap(-1, {BOMB}); m.write(bytes({BOMB})); result = 'filled'"
 MEMFD = f"""
@@ -105,7 +105,7 @@ def test_memory_of_all_processes_counts_together(profile: str, counted: str) -> 
 
 SHARED_BY_FORKS = """
 import os, time
-b = bytearray(150 * 2**20); b[::4096] = b'x' * len(b[::4096])
+b = bytearray(100 * 2**20); b[::4096] = b'x' * len(b[::4096])
 for _ in range(4):
     if os.fork() == 0:
         time.sleep(1000)

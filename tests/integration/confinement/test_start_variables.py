@@ -76,10 +76,12 @@ def test_sets_of_text_have_one_order(
         monkeypatch.setenv("PYTHONHASHSEED", seed)
     fixed = {"PYTHONHASHSEED": "7" if seed == "7" else "0"}
     expected = subprocess.check_output([sys.executable, "-c", _PRINT], env=fixed, text=True)
-    for options in (
-        *({}, {"use_async_envs": True, "num_workers": 2}, {"sandbox": ["process"] * 2}),
-        *([{"policy": {"environment": ("PYTHONHASHSEED",)}}] if seed == "7" else []),
-    ):
+    uses: dict[str | None, list[dict[str, Any]]] = {
+        None: [{}, {"use_async_envs": True, "num_workers": 2}, {"sandbox": ["process"] * 2}],
+        "7": [{}, {"policy": {"environment": ("PYTHONHASHSEED",)}}],
+        "random": [{"use_async_envs": True, "num_workers": 2}],
+    }
+    for options in uses[seed]:
         assert _orders(folder, **options) == {expected.strip()}, options
 
 

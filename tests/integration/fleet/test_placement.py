@@ -44,16 +44,8 @@ def test_workers_are_spread_over_all_places(rows: Path, servers: list[Listening]
 def test_a_full_server_is_followed_by_the_next(
     rows: Path, servers: list[Listening], serve: Callable[..., Listening]
 ) -> None:
-    """By the word of the server, and where that was too old by its refusal."""
-    small = serve("small", "--max-jails", "1")
-    sandboxes = [small.sandbox(), servers[0].sandbox()]
-    with started(rows, n_envs=4, sandbox=sandboxes, num_workers=4) as env:
-        assert (sorted(Counter(places(env)).values()), small.jails()) == ([1, 3], 1)
-        env.step(np.zeros(4, int))
-
-
-def test_no_room_anywhere_is_told_of_all(rows: Path, serve: Callable[..., Listening]) -> None:
-    """It is the one for which one may wait; nothing is left open of the workers that had room."""
+    """By the word of the server, and where that was too old by its refusal. No room anywhere is the
+    error for which one may wait: nothing is left open of the workers that had room."""
     small = [serve(name, "--max-jails", "1") for name in ("one", "two")]
     with make_env(rows, n_envs=3, sandbox=[s.sandbox() for s in small], num_workers=3) as suites:
         with pytest.raises(ServerBusyError, match="quota of 1") as caught:
@@ -61,6 +53,10 @@ def test_no_room_anywhere_is_told_of_all(rows: Path, serve: Callable[..., Listen
         assert "The other places of the fleet" in str(caught.value)
         assert "of 3, on tcp://" in str(caught.value)
     assert all(eventually(lambda s=server: s.jails() == 0) for server in small)
+    sandboxes = [small[0].sandbox(), servers[0].sandbox()]
+    with started(rows, n_envs=4, sandbox=sandboxes, num_workers=4) as env:
+        assert (sorted(Counter(places(env)).values()), small[0].jails()) == ([1, 3], 1)
+        env.step(np.zeros(4, int))
 
 
 def test_a_server_that_is_not_there_gets_no_worker(rows: Path, servers: list[Listening]) -> None:

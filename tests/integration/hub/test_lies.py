@@ -145,12 +145,26 @@ def test_repository_over_a_limit_is_refused_before_the_download(
         get()
 
 
-def test_endless_listing_is_left_at_the_limit(stub_hub: StubHub, get: Fetch) -> None:
-    stub_hub.add("org/repo", {"env.py": GOOD, **{f"f{n}": b"" for n in range(50)}})
+def test_endless_listing_is_left_at_the_limit(
+    stub_hub: StubHub, get: Fetch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pages without files count for no limit of ours, and each names a next one."""
+
+    def pages() -> int:
+        return len([request for request in stub_hub.requests if "/tree/" in request])
+
+    repository = stub_hub.add("org/repo", {"env.py": GOOD, **{f"f{n}": b"" for n in range(50)}})
     stub_hub.page_size = 2
     with pytest.raises(errors.SnapshotTooLargeError, match="max_files=5"):
         get(limits=SnapshotLimits(max_files=5))
-    assert len([request for request in stub_hub.requests if "/tree/" in request]) == 3
+    assert pages() == 3
+    folders = [{"type": "directory", "oid": "d" * 40, "size": 0, "path": "a"}] * 1000
+    monkeypatch.setattr("envhub_sandbox.hub.client.MAX_IDLE_PAGES", 20)
+    monkeypatch.setattr(repository, "tree", lambda: folders)
+    stub_hub.page_size = 1
+    with pytest.raises(errors.SnapshotIntegrityError, match="listing does not end"):
+        get()
+    assert pages() == 3 + 21
 
 
 @pytest.mark.parametrize("name", ["../evil.py", "/etc/cron.d/evil", "a\x00b"])
@@ -245,19 +259,6 @@ def plain_get(url: str) -> bytes:
     from huggingface_hub.utils import get_session
 
     return bytes(get_session().get(url, timeout=60).content)
-
-
-def test_endless_pages_without_files_are_left(
-    stub_hub: StubHub, repository: StubRepository, get: Fetch, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They count for no limit of ours, and each names a next one."""
-    folders = [{"type": "directory", "oid": "d" * 40, "size": 0, "path": "a"}] * 1000
-    monkeypatch.setattr("envhub_sandbox.hub.client.MAX_IDLE_PAGES", 20)
-    monkeypatch.setattr(repository, "tree", lambda: folders)
-    stub_hub.page_size = 1
-    with pytest.raises(errors.SnapshotIntegrityError, match="listing does not end"):
-        get()
-    assert len([request for request in stub_hub.requests if "/tree/" in request]) == 21
 
 
 @pytest.mark.parametrize("body", [b"[" * 100_000, b"7", b'[{"size": 1' + b"0" * 5000 + b"}]"])

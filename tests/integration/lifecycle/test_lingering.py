@@ -53,16 +53,14 @@ def _servers() -> set[int]:
 
 
 def test_it_goes_when_its_time_has_come() -> None:
+    """With none, with the last environment."""
+    used(0)
+    assert not started()
     used(0.3)
     assert eventually(lambda: not started())
     used(600)
     assert _servers()
     stop_idle()
-
-
-def test_with_no_time_it_ends_with_the_last_environment() -> None:
-    used(0)
-    assert not started()
 
 
 def test_a_suite_that_is_not_closed_holds_it() -> None:

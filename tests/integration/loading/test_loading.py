@@ -88,8 +88,9 @@ class TestWhereTheCodeRuns:
                     del sys.modules[name]
         assert marker.read_text().split() == [str(os.getpid())]
 
-    def test_siblings_assets_and_dataclasses_work(self) -> None:
-        """Siblings, relative imports, assets by both kinds of path, postponed annotations."""
+    def test_siblings_assets_dataclasses_and_children_work(self) -> None:
+        """Siblings, relative imports, assets by both kinds of path, postponed annotations. The
+        repository's own multiprocessing gets its classes through pickle and back."""
         with make_env(sample("marker")) as suites:
             env = suites.env
             for name, value in (
@@ -101,12 +102,8 @@ class TestWhereTheCodeRuns:
                 ("settings_repr", "Settings(size=3, bolts=[Bolt(diameter=4)])"),
             ):
                 assert env.get_attr(name) == (value,)
-
-    @pytest.mark.parametrize("method", ["fork", "spawn", "forkserver"])
-    def test_classes_of_the_repository_can_be_pickled_to_its_children(self, method: str) -> None:
-        """The repository's own multiprocessing gets its classes through pickle and back."""
-        with make_env(sample("marker")) as suites:
-            assert suites.env.call("child_says", method) == ((9, "Settings"),)
+            for method in ("fork", "spawn", "forkserver"):
+                assert env.call("child_says", method) == ((9, "Settings"),), method
 
     def test_writes_stay_in_the_scratch(self, tmp_path: Path) -> None:
         """Home, working and temporary directory can be written to, and are not the caller's."""

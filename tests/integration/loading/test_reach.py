@@ -98,22 +98,6 @@ def test_what_is_not_there_fails_with_what_brings_it(env: Any, code: str, advice
     assert str(caught.value).lower().count("a jail has no ") == 1
 
 
-def test_other_errors_get_no_advice(env: Any) -> None:
-    """What has nothing to do with a network or a display."""
-    env.reset()
-    with pytest.raises(errors.RemoteEnvError) as caught:
-        env.call("run", "raise ValueError('the display of 3 networks is 97')")
-    assert "A jail has no" not in str(caught.value)
-
-
-def test_a_window_that_cannot_be_opened_is_no_mere_abort(env: Any) -> None:
-    env.reset()
-    said = 'qt.qpa.plugin: Could not load the Qt platform plugin "xcb" in ""'
-    with pytest.raises(errors.WorkerDiedError, match="It tried to open a window") as caught:
-        env.call("run", f"sys.stderr.write({said!r} + chr(10)); sys.stderr.flush(); os.abort()")
-    assert caught.value.signal == "SIGABRT"
-
-
 @pytest.mark.filterwarnings("default")
 def test_lerobot_that_is_imported_for_an_annotation_needs_no_package(tmp_path: Path) -> None:
     """A stub stands in, nothing is installed, and the caller is warned of it."""
@@ -148,12 +132,20 @@ def test_a_granted_home_does_not_break_loading(
     env.close()
 
 
-def test_terminals_that_are_used_up_are_told(env: Any) -> None:
-    """``pty`` says 'out of pty devices'; here there is a number of them, and it is the jail's."""
+def test_only_what_a_jail_lacks_is_told(env: Any) -> None:
+    """``pty`` says 'out of pty devices'; here there is a number of them, and it is the jail's. What
+    has nothing to do with a network or a display gets no advice; a window that cannot be opened is
+    no mere abort."""
     env.reset()
     code = "import os, pty\nkept = [os.openpty() for _ in range(64)]\n"
-    with pytest.raises(
-        errors.RemoteEnvError, match=r"out of pty devices\. A jail .* at most 64 pseudo"
-    ):
+    lacks = r"out of pty devices\. A jail .* at most 64 pseudo"
+    with pytest.raises(errors.RemoteEnvError, match=lacks):
         env.call("run", f"{code}pty.fork()")
     env.call("run", "[os.close(fd) for pair in kept for fd in pair]")
+    with pytest.raises(errors.RemoteEnvError) as caught:
+        env.call("run", "raise ValueError('the display of 3 networks is 97')")
+    assert "A jail has no" not in str(caught.value)
+    said = 'qt.qpa.plugin: Could not load the Qt platform plugin "xcb" in ""'
+    with pytest.raises(errors.WorkerDiedError, match="It tried to open a window") as died:
+        env.call("run", f"sys.stderr.write({said!r} + chr(10)); sys.stderr.flush(); os.abort()")
+    assert died.value.signal == "SIGABRT"

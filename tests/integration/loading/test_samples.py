@@ -124,16 +124,13 @@ class TestManyTasks:
         assert eventually(lambda: descendants() <= before)
 
     def test_sub_environments_run_in_processes_of_their_own(self, suites: EnvSuites) -> None:
-        env = suites["rooms"][0]
-        env.reset(seed=0)
-        pids = env.get_attr("pid")
-        assert len(set(pids)) > 1 or len(os.sched_getaffinity(0)) == 1  # a core for each
-        _, _, _, _, infos = env.step([0, 0, 0, 0])
-        assert infos["pid"].tolist() == list(pids)
-
-    def test_closing_one_task_leaves_the_others(self, suites: EnvSuites) -> None:
+        """Closing one task leaves the others."""
         first, second = suites["rooms"][0], suites["rooms"][1]
         first.reset(seed=0)
+        pids = first.get_attr("pid")
+        assert len(set(pids)) > 1 or len(os.sched_getaffinity(0)) == 1  # a core for each
+        _, _, _, _, infos = first.step([0, 0, 0, 0])
+        assert infos["pid"].tolist() == list(pids)
         second.reset(seed=0)
         first.close()
         first.close()

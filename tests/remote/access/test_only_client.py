@@ -19,12 +19,6 @@ from tests.support.ports import lasting_port
 from tests.support.samples import sample
 
 
-@pytest.fixture
-def keys() -> tuple[str, str]:
-    public, secret = new_keys()
-    return key_text(public), key_text(secret)
-
-
 @contextlib.contextmanager
 def announcing(public: str, state: Path) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
     words = ("--bind", f"tcp://127.0.0.1:{lasting_port()}", "--state-dir", str(state))
@@ -42,26 +36,22 @@ def announcing(public: str, state: Path) -> Iterator[tuple[subprocess.Popen[str]
             process.terminate()
 
 
-@pytest.fixture
-def announced(
-    keys: tuple[str, str], tmp_path: Path
-) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
-    with announcing(keys[0], tmp_path / "state") as found:
-        yield found
-
-
-def test_the_one_client_comes_in_and_no_other(
-    announced: tuple[subprocess.Popen[str], dict[str, Any]], keys: tuple[str, str]
-) -> None:
-    """By its key alone; the server has no secret of the client's, and prints none of its own."""
-    _, said = announced
-    assert attestation.parse(json.dumps(said).encode()).profiles
-    for secret, comes_in in ((keys[1], True), (key_text(new_keys()[1]), False)):
-        sandbox = RemoteSandbox(said["endpoint"], server_key=said["server_key"], client_key=secret)
-        refused = pytest.raises(SandboxUnavailableError, match="does not know our key")
-        expected = contextlib.nullcontext() if comes_in else refused
-        with expected, make_env(sample("counter"), sandbox=sandbox) as suites:
-            suites.env.reset(seed=0)
+def test_the_one_client_comes_in_and_no_other(tmp_path: Path) -> None:
+    """By its key alone; the server has no secret of the client's, and prints none of its own. It
+    ends with its stdin, as when the program that started it is killed."""
+    public, secret = map(key_text, new_keys())
+    with announcing(public, tmp_path / "state") as (process, said):
+        assert attestation.parse(json.dumps(said).encode()).profiles
+        for key, comes_in in ((secret, True), (key_text(new_keys()[1]), False)):
+            place = RemoteSandbox(said["endpoint"], server_key=said["server_key"], client_key=key)
+            refused = pytest.raises(SandboxUnavailableError, match="does not know our key")
+            expected = contextlib.nullcontext() if comes_in else refused
+            with expected, make_env(sample("counter"), sandbox=place) as suites:
+                suites.env.reset(seed=0)
+        assert process.poll() is None
+        process.stdin.close()
+        assert process.wait(60) == 0
+    assert not list((tmp_path / "state").glob("client*"))
 
 
 def test_the_files_of_two_clients_are_apart(tmp_path: Path) -> None:
@@ -77,17 +67,6 @@ def test_the_files_of_two_clients_are_apart(tmp_path: Path) -> None:
                 suites.env.reset(seed=0)
         brought.add(public[:32])
         assert {path.name for path in (state / "store").iterdir() if path.is_dir()} == brought
-
-
-def test_it_ends_with_its_stdin(
-    announced: tuple[subprocess.Popen[str], dict[str, Any]], tmp_path: Path
-) -> None:
-    """As when the program that started it is killed; no key of a client was made."""
-    process, _ = announced
-    assert process.poll() is None
-    process.stdin.close()
-    assert process.wait(60) == 0
-    assert not list((tmp_path / "state").glob("client*"))
 
 
 @pytest.mark.parametrize(

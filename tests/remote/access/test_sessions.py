@@ -76,23 +76,23 @@ def test_the_place_of_a_program_that_ends_is_free_at_once(
 
 
 def test_a_killed_programs_place_is_for_others(narrow: Listening, repository: Path) -> None:
-    """Its jail stays, for it may be cut off only; the next of its key gets the place of both."""
-    with at_work(narrow, repository) as killed:
-        killed.kill()
+    """Its jail stays, for it may be cut off only; the next of its key gets the place of both. The
+    control: nobody is pushed out who is still there. ``status``, asked with the client's own key,
+    takes no place meanwhile, and holds none then."""
+    with at_work(narrow, repository) as client:
+        said, _ = program(narrow, repository, "closes").communicate(timeout=120)
+        assert b"which is the server's quota" in said
+        for _ in range(2):
+            asked = worker("status", *narrow.as_client())
+            assert asked.returncode == 0, asked.stderr
+            assert "1 jail" in asked.stdout
+        assert (narrow.jails(), client.poll()) == (1, None)
+        client.kill()
     assert eventually(lambda: [one["connections"] for one in narrow.sessions()] == [0])
     assert narrow.jails() == 1
     said, _ = program(narrow, repository, "closes").communicate(timeout=120)
     assert said == b"ready\n"
     assert eventually(lambda: not narrow.sessions())
-
-
-def test_a_place_that_is_in_use_is_kept(narrow: Listening, repository: Path) -> None:
-    """The control: nobody is pushed out who is still there."""
-    with at_work(narrow, repository) as first:
-        said, _ = program(narrow, repository, "closes").communicate(timeout=120)
-        assert b"which is the server's quota" in said
-        assert narrow.jails() == 1
-    assert first.returncode == 0
 
 
 def test_connections_that_have_gone_take_no_session(narrow: Listening) -> None:
@@ -105,15 +105,3 @@ def test_connections_that_have_gone_take_no_session(narrow: Listening) -> None:
 
     for name in (b"one", b"two", b"three"):
         assert eventually(lambda: is_welcome(name))  # noqa: B023
-
-
-def test_status_takes_no_place_of_a_client(narrow: Listening, repository: Path) -> None:
-    """Asked with the client's own key, while its one place is in use; nor does it hold one then."""
-    with at_work(narrow, repository) as client:
-        for _ in range(2):
-            asked = worker("status", *narrow.as_client())
-            assert asked.returncode == 0, asked.stderr
-            assert "1 jail" in asked.stdout
-    assert client.returncode == 0
-    assert eventually(lambda: not connected(narrow))
-    assert program(narrow, repository, "closes").communicate(timeout=120)[0] == b"ready\n"

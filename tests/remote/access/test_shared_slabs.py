@@ -49,16 +49,18 @@ def files(server: Listening) -> int:
     return len(os.listdir(f"/proc/{server.process.pid}/fd"))
 
 
-def test_one_request_makes_slabs_once_for_each_runner(env: Any) -> None:
-    """Each takes time of a server that others use, and one request could ask for 40,000."""
+def test_slabs_are_no_memory_beside_the_limit(env: Any, server: Listening) -> None:
+    """What the server reads of them first is its own memory, which no limit of the jail bounds.
+    One request makes them once for each runner: each takes time of a server that others use, and
+    one could ask for 40,000. What is made again leaves nothing."""
     refused = share(env, [(0, 64)] * 2)
     assert isinstance(refused, m.Refusal), refused
     assert refused.error == "LocalProtocolError"
     assert isinstance(share(env, [(at, 64) for at in range(6)]), m.Done)
-
-
-def test_slabs_are_no_memory_beside_the_limit(env: Any) -> None:
-    """What the server reads of them first is its own memory, which no limit of the jail bounds."""
+    before = files(server)
+    for _ in range(MANY):
+        assert isinstance(share(env, [(0, 64)]), m.Done)
+    assert files(server) < before + MANY, "a connection may come; each slab would be there still"
     most = 63 * MIB
     assert isinstance(share(env, [(0, most), (1, most), (2, most)]), m.Done)
     refused = share(env, [(3, most), (4, most), (5, most)])
@@ -82,14 +84,6 @@ def test_slabs_are_no_memory_beside_the_quota(tmp_path: Path) -> None:
     with listening(tmp_path / "full", quota) as server, opened(server) as env:
         assert isinstance(share(env, [(0, 64)]), m.Refusal)
         assert env.step(env.action_space.sample())[0].shape == env.observation_space.shape
-
-
-def test_slabs_that_are_made_again_leave_nothing(env: Any, server: Listening) -> None:
-    share(env, [(0, 64)])
-    before = files(server)
-    for _ in range(MANY):
-        assert isinstance(share(env, [(0, 64)]), m.Done)
-    assert files(server) < before + MANY, "a connection may come; each slab would be there still"
 
 
 def test_what_is_made_for_a_jail_that_ends_goes_with_it(server: Listening) -> None:

@@ -156,8 +156,9 @@ def good(one: Watched, repository: Path) -> Iterator[Any]:
         assert (env.step(np.array([0]))[0].tolist(), one.get("/healthz")[0]) == ([[1.0]], 200)
 
 
-def test_slow_readers_and_writers_are_shown_the_door(one: Watched, good: Any) -> None:
-    """A request that does not end, and an answer that nobody reads."""
+def test_slow_readers_and_huge_requests_are_shown_the_door(one: Watched, good: Any) -> None:
+    """A request that does not end, and an answer that nobody reads. One that is larger than any of
+    ours is answered or ended, and not kept."""
     silent, slow, deaf = knock(one.port), knock(one.port), knock(one.port)
     slow.sendall(b"GET /metrics HTTP/1.1\r\n")
     deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
@@ -166,9 +167,18 @@ def test_slow_readers_and_writers_are_shown_the_door(one: Watched, good: Any) ->
     assert hears(silent) == hears(slow) == b""
     for connection in (silent, slow, deaf):
         connection.close()
+    before = one.server.memory()
+    for data in (b"x" * 64 * _MIB, b"GET /" + b"a" * 16 * _MIB, b"GET / HTTP/1.1\r\n" * 1_000_000):
+        with knock(one.port) as connection, contextlib.suppress(ConnectionError):
+            connection.sendall(data)
+            heard = hears(connection)
+            assert heard == b"" or heard.startswith(b"HTTP/1.1 4"), heard[:100]
+    assert one.server.memory() - before < 16 * _MIB
 
 
-def test_more_connections_than_there_is_room_for(one: Watched, good: Any) -> None:
+def test_a_crowd_does_not_hold_the_clients(one: Watched, good: Any) -> None:
+    """Of connections, more than there is room for; or of readers: figures are made once for all of
+    them, and steps go on meanwhile."""
     before = psutil.Process(one.server.process.pid).num_fds()
     with contextlib.ExitStack() as crowd:
         for _ in range(10 * MAX_CONNECTIONS):
@@ -185,17 +195,23 @@ def test_more_connections_than_there_is_room_for(one: Watched, good: Any) -> Non
         now = psutil.Process(one.server.process.pid).num_fds()
         assert now < before + 5 * MAX_CONNECTIONS
         good.call("count")
+    stop = threading.Event()
 
+    def read() -> None:
+        while not stop.is_set():
+            with contextlib.suppress(OSError, http.client.HTTPException):
+                get(one.port, "/metrics")
 
-def test_a_huge_request_is_not_kept(one: Watched, good: Any) -> None:
-    """It is answered, or ended, once it is larger than any of ours."""
-    before = one.server.memory()
-    for data in (b"x" * 64 * _MIB, b"GET /" + b"a" * 16 * _MIB, b"GET / HTTP/1.1\r\n" * 1_000_000):
-        with knock(one.port) as connection, contextlib.suppress(ConnectionError):
-            connection.sendall(data)
-            heard = hears(connection)
-            assert heard == b"" or heard.startswith(b"HTTP/1.1 4"), heard[:100]
-    assert one.server.memory() - before < 16 * _MIB
+    readers = [threading.Thread(target=read) for _ in range(4)]
+    for reader in readers:
+        reader.start()
+    try:
+        for _ in range(50):
+            good.call("count")
+    finally:
+        stop.set()
+        for reader in readers:
+            reader.join()
 
 
 @pytest.mark.parametrize(
@@ -228,27 +244,6 @@ def test_only_whole_requests_are_answered(one: Watched, request_: bytes, status:
     assert head.startswith(b"HTTP/1.1 %d " % status)
     read = status == 200 and not request_.startswith(b"HEAD")
     assert bool(body) == (read or status == 404)
-
-
-def test_a_crowd_of_readers_does_not_hold_the_clients(one: Watched, good: Any) -> None:
-    """Figures are made once for all of them; steps go on meanwhile."""
-    stop = threading.Event()
-
-    def read() -> None:
-        while not stop.is_set():
-            with contextlib.suppress(OSError, http.client.HTTPException):
-                get(one.port, "/metrics")
-
-    readers = [threading.Thread(target=read) for _ in range(4)]
-    for reader in readers:
-        reader.start()
-    try:
-        for _ in range(50):
-            good.call("count")
-    finally:
-        stop.set()
-        for reader in readers:
-            reader.join()
 
 
 def test_a_newcomer_takes_the_place_of_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
