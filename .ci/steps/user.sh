@@ -16,7 +16,7 @@ export PYTHON=/usr/bin/python3
 # runs it. What the client makes of answers, of archives and of names is the same for all.
 tests=(tests/attacks/{files,kernel,network,processes,resources,runner})
 tests+=(tests/attacks/packages/test_{builds,packages}.py)
-tests+=(tests/integration/confinement tests/integration/lifecycle/test_{lingering,umask}.py)
+tests+=(tests/integration/confinement tests/integration/lifecycle/test_{lingering,odd_starts}.py)
 tests+=(tests/integration/packages/test_builds.py)
 tests+=(tests/unit/worker/{lockdown,spawn,access/store,test_file_access.py})
 tests+=(tests/unit/client/{system,hub/test_{store,local}.py,sources/test_checkout.py,sandboxes/test_{process,pool}.py})
