@@ -18,13 +18,13 @@ import numpy as np
 from envhub_worker.protocol.errors import UNTRUSTED, RemoteProtocolError
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.names import (
-    MAX_NAMES,
     checked_key,
     checked_name,
-    is_servable,
     optional_name,
     plain_keys,
+    servable_names,
     string_keys,
+    texts_by_name,
 )
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.spaces.batches import is_batch
@@ -157,8 +157,8 @@ def decode_manifest(
         return Manifest(
             envs=decoded,
             lazy=_typed(fields, "lazy", bool),
-            interpreter=_texts(fields["interpreter"], "interpreter"),
-            packages=_texts(fields["packages"], "packages"),
+            interpreter=texts_by_name(fields["interpreter"], "interpreter"),
+            packages=texts_by_name(fields["packages"], "packages"),
         )
 
 
@@ -190,7 +190,7 @@ def _decode_env(value: object, reader: SpaceReader) -> EnvManifest:
         metadata=read_metadata_facts(fields["metadata"]),
         render_mode=optional_name(fields["render_mode"], "render_mode"),
         spec=read_spec_facts(fields["spec"]),
-        attributes=_attributes(fields["attributes"]),
+        attributes=servable_names(fields["attributes"]),
         type_name=checked_name(fields["type_name"], "type_name"),
         **spaces,
     )
@@ -206,17 +206,6 @@ def _typed(fields: Mapping[str, Any], name: str, kind: type) -> Any:
     if type(fields[name]) is not kind:
         raise RemoteProtocolError(f"{name} is not of type {kind.__name__}")
     return fields[name]
-
-
-def _attributes(value: object) -> tuple[str, ...]:
-    """Returns the servable names and drops the others, which honest classes have, too."""
-    if type(value) is not tuple or len(value) > MAX_NAMES:
-        raise RemoteProtocolError(f"attributes is not a tuple of at most {MAX_NAMES} names")
-    return tuple(filter(is_servable, [checked_name(item, "attributes") for item in value]))
-
-
-def _texts(value: object, name: str) -> dict[str, str]:
-    return {key: checked_name(text, name) for key, text in string_keys(value, name).items()}
 
 
 MAX_METADATA = 4096

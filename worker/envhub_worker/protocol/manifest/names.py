@@ -130,5 +130,17 @@ def string_keys(value: object, role: str) -> dict[str, Any]:
     return mapping
 
 
+def texts_by_name(value: object, role: str) -> dict[str, str]:
+    """Returns a mapping whose keys and values pass ``checked_name``."""
+    return {key: checked_name(text, role) for key, text in string_keys(value, role).items()}
+
+
+def servable_names(value: object) -> tuple[str, ...]:
+    """Returns the servable attributes and drops the others, which honest classes have, too."""
+    if type(value) is not tuple or len(value) > MAX_NAMES:
+        raise RemoteProtocolError(f"attributes is not a tuple of at most {MAX_NAMES} names")
+    return tuple(filter(is_servable, [checked_name(item, "attributes") for item in value]))
+
+
 CONVERTED = "envhub_converted"
 """Of a sub-environment whose ``reset`` Gymnasium cannot call: what the sandbox has converted."""
