@@ -168,15 +168,12 @@ class StreamReader:
         # in one chunk would take quadratic time.
         taken = data[: _head_bytes(self._pending, self._limits) - len(self._pending)]
         self._pending += taken
-        if len(self._pending) == _head_bytes(self._pending, self._limits):
-            self._begin_body()
+        size = len(self._pending)
+        if size == _head_bytes(self._pending, self._limits):
+            self._head = _read_head(self._pending, size, self._limits, self._check)
+            self._pending.clear()
+            self._body, self._filled = _space(sum(self._head[1])), 0
         return data[taken.nbytes :]
-
-    def _begin_body(self) -> None:
-        self._head = _read_head(self._pending, len(self._pending), self._limits, self._check)
-        self._pending.clear()
-        self._body = _space(sum(self._head[1]))
-        self._filled = 0
 
     def _fill_body(self, data: memoryview) -> memoryview:
         assert self._body is not None

@@ -311,6 +311,15 @@ def check_content(array: Array) -> None:
 
 Encoder = Any
 """An ``encoder.Encoder``, which imports this module."""
+
+
+def add(encoder: Encoder, array: Array) -> Any:
+    """Takes the bytes of an array into a message; returns the extension that describes it."""
+    if encoder.writer is None:
+        encoder.writer = ArrayWriter()
+    return encoder.writer.add(array)
+
+
 Tensors = Callable[[Array, str], object] | None
 
 _WIDEST: dict[str, Any] = {"g": np.float64, "G": np.complex128}
@@ -322,7 +331,7 @@ def _write_array(encoder: Encoder, array: Array) -> object:
     if array.dtype.char in _WIDEST and encoder.pickler is None:
         array = array.astype(_WIDEST[array.dtype.char])
     if array.dtype.kind not in ("O" if encoder.pickler else "OV"):
-        return encoder.array(array)
+        return add(encoder, array)
     return [msgpack.ExtType(wire.OBJECTS, pack_shape(array.shape)), *array.ravel().tolist()]
 
 
@@ -373,9 +382,7 @@ def write_numpy(encoder: Encoder, value: Any) -> object:
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(value, getattr(torch, "Tensor", ())):
         name, bits = tensor_bits(value)
-        return (
-            encoder.unknown(value) if bits is None else [_TENSOR_HEADS[name], encoder.array(bits)]
-        )
+        return encoder.unknown(value) if bits is None else [_TENSOR_HEADS[name], add(encoder, bits)]
     if isinstance(value, (np.str_, np.bytes_)):
         return _write_text_scalar(encoder, value)
     if isinstance(value, np.generic):

@@ -25,7 +25,7 @@ from envhub_worker.protocol.errors import LocalProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 
 if TYPE_CHECKING:
-    from envhub_worker.protocol.codec.arrays import Array, ArrayWriter
+    from envhub_worker.protocol.codec.arrays import ArrayWriter
 
 Describer = Callable[[object], "tuple[int, object] | None"]
 """The code and the plain value of what the peer can make again; None of all else."""
@@ -34,13 +34,13 @@ Describer = Callable[[object], "tuple[int, object] | None"]
 class Encoder:
     """Turns one value into frames; msgpack calls ``default`` for what it cannot pack itself."""
 
-    __slots__ = ("_writer", "describer", "limits", "pickler")
+    __slots__ = ("describer", "limits", "pickler", "writer")
 
     def __init__(
         self, pickler: Pickler | None, limits: WireLimits, describer: Describer | None = None
     ) -> None:
         self.pickler, self.limits, self.describer = pickler, limits, describer
-        self._writer: ArrayWriter | None = None
+        self.writer: ArrayWriter | None = None  # made for the first array of the message
 
     def frames(self, value: object) -> list[Buffer]:
         """Returns the header frame and the arrays' frames."""
@@ -49,25 +49,17 @@ class Encoder:
             document = msgpack.packb(value, **options)
         except UnicodeEncodeError:
             # Lone surrogates are not UTF-8. They arrive as the text "\\udc80", visibly.
-            self._writer = None
+            self.writer = None
             document = msgpack.packb(value, **options, unicode_errors="backslashreplace")
         wire.check_document(document, self.limits)
         prefix = wire.DOCUMENT_BYTES.pack(len(document))
-        if self._writer is None:
+        if self.writer is None:
             return [prefix + document]
-        return [b"".join((prefix, document, *self._writer.tail)), *self._writer.frames]
+        return [b"".join((prefix, document, *self.writer.tail)), *self.writer.frames]
 
     def default(self, value: Any) -> object:
         """Returns what msgpack packs in place of ``value``."""
         return _WRITERS.get(type(value), _write_other)(self, value)
-
-    def array(self, array: Array) -> Any:
-        """Takes the bytes of an array; returns the extension that describes it."""
-        if self._writer is None:
-            from envhub_worker.protocol.codec.arrays import ArrayWriter
-
-            self._writer = ArrayWriter()
-        return self._writer.add(array)
 
     def unknown(self, value: object) -> object:
         """Pickles or describes what has no form."""
@@ -101,7 +93,9 @@ def _write_pickled(encoder: Encoder, pickled: PickledValue) -> object:
         return msgpack.ExtType(wire.PICKLE, data)
     import numpy as np
 
-    described = encoder.array(np.frombuffer(data, np.uint8))
+    from envhub_worker.protocol.codec.arrays import add
+
+    described = add(encoder, np.frombuffer(data, np.uint8))
     return msgpack.ExtType(wire.PICKLE_FRAME, described.data)
 
 

@@ -27,6 +27,7 @@ from envhub_worker.protocol.codec.inert import (
     type_name,
 )
 from envhub_worker.protocol.codec.wire import PickledValue, Pickler
+from envhub_worker.protocol.errors import LocalProtocolError
 from envhub_worker.protocol.limits import WireLimits
 
 _DEPTH = 16
@@ -41,9 +42,21 @@ _ARRAYS = frozenset("?bBhHiIlLqQefdFDmMS")
 """Characters of dtypes whose values are entirely in their bytes."""
 
 
-def handed_over(value: object, pickler: Pickler, limits: WireLimits) -> object:
-    """Returns the value if the wire carries it exactly, else its pickle."""
-    return value if _Judge(limits).holds(value, 0) else PickledValue(pickler(value))
+def handed_over(
+    fields: dict[str, object], handed: Sequence[str], pickler: Pickler, limits: WireLimits
+) -> list[object]:
+    """Returns the fields to send: those of the caller's own objects are pickled if the wire does
+    not carry them exactly. Raises ``LocalProtocolError``: one cannot be pickled.
+    """
+    sent = fields.copy()
+    for name in handed:
+        try:
+            if not _Judge(limits).holds(fields[name], 0):
+                sent[name] = PickledValue(pickler(fields[name]))
+        except Exception as error:  # whatever the caller's own classes raise
+            text = unpicklable(name, fields[name], error, pickler)
+            raise LocalProtocolError(text) from error
+    return list(sent.values())
 
 
 class _Judge:

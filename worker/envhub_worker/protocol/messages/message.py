@@ -138,40 +138,20 @@ def pack(
     Raises ``LocalProtocolError``: a field holds what the wire cannot carry; nothing was sent.
     """
     cls = type(message)
-    values = values_of(message)
-    if pickler is not None and cls.HANDED:
-        values = _handed(message, values, pickler, limits)
-    value, names = [cls.kind, *values], ("kind", *cls.FIELDS)
+    values, names = values_of(message), ("kind", *cls.FIELDS)
     try:
-        return encode(value, pickler, limits, names, describer, reduces=reduces)
+        if pickler is not None and cls.HANDED:
+            from envhub_worker.protocol.codec.unsendable import handed_over
+
+            values = handed_over(message.__dict__, cls.HANDED, pickler, limits)
+        return encode([cls.kind, *values], pickler, limits, names, describer, reduces=reduces)
     except LocalProtocolError as error:
-        raise LocalProtocolError(f"{_asked(message)}{error}") from error.__cause__
-
-
-def _handed(
-    message: Message, values: list[Any], pickler: Pickler, limits: WireLimits
-) -> list[object]:
-    """Returns the fields to send, in which the caller's own objects are pickled if need be."""
-    from envhub_worker.protocol.codec.unsendable import handed_over, unpicklable
-
-    sent = list(values)
-    for index, name in enumerate(message.FIELDS):
-        if name not in message.HANDED:
-            continue
-        try:
-            sent[index] = handed_over(values[index], pickler, limits)
-        except Exception as error:  # whatever the caller's own classes raise
-            text = unpicklable(name, values[index], error, pickler)
-            raise LocalProtocolError(f"{_asked(message)}{text}") from error
-    return sent
-
-
-def _asked(message: Message) -> str:
-    """Returns a prefix for an error about the arguments of the caller's call."""
-    if not message.ASKS:
-        return ""
-    name = getattr(message, "name", None)
-    return f"{message.ASKS}: " if name is None else f"{message.ASKS}({name!r}): "
+        if not cls.ASKS:
+            raise
+        # in front: which of the caller's calls it is about
+        name = getattr(message, "name", None)
+        asked = cls.ASKS if name is None else f"{cls.ASKS}({name!r})"
+        raise LocalProtocolError(f"{asked}: {error}") from error.__cause__
 
 
 def unpack(
