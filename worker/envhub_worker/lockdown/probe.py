@@ -15,7 +15,9 @@ serves, and reports it; the client compares the report with its flags.
 
 from __future__ import annotations
 
+import functools
 import json
+import operator
 import os
 import socket
 import sys
@@ -250,12 +252,14 @@ def own_runtime() -> Runtime:
 
 def surroundings() -> Surroundings:
     """Returns the confinement around this process, which must be single-threaded."""
-    status = _status()
+    lines = Path("/proc/self/status").read_text().splitlines()
+    status = {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    held = (int(status[f"Cap{name}"], 16) for name in ("Inh", "Prm", "Eff", "Bnd", "Amb"))
     return Surroundings(
         profiles=tuple(profiles(probe()["layers"], landlock.version())),
         landlock=landlock.version(),
         user=os.geteuid(),
-        capabilities=_held_capabilities(status),
+        capabilities=functools.reduce(operator.or_, held),
         no_new_privileges=status.get("NoNewPrivs") == "1",
         seccomp=status.get("Seccomp") == "2",
         read_only=bool(os.statvfs("/").f_flag & os.ST_RDONLY),
@@ -315,15 +319,3 @@ def _number(path: Path) -> int | None:
 def _words(path: Path, count: int) -> list[str]:
     words = (procfs.text(str(path)) or "").split()
     return [*words, *[""] * count][:count]
-
-
-def _status() -> dict[str, str]:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}
-
-
-def _held_capabilities(status: dict[str, str]) -> int:
-    held = 0
-    for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb"):
-        held |= int(status[name], 16)
-    return held

@@ -263,8 +263,12 @@ def _mount_views(snapshot: str, packages: str) -> View:
         _bind(f"{_SCRATCH}/empty", _SKELETON)
     if snapshot in view.shared:
         _bind(snapshot, WORK)
-    else:
-        _mount_links(snapshot)
+        return view
+    # Links into the read-only snapshot, in a folder that takes new files.
+    os.mkdir(f"{_SCRATCH}/work", 0o700)
+    _bind(f"{_SCRATCH}/work", WORK)
+    for name in os.listdir(snapshot):
+        os.symlink(f"{snapshot}/{name}", f"{WORK}/{name}")
     return view
 
 
@@ -290,13 +294,6 @@ def mount_overlay(path: str, lower: Sequence[str], upper: str) -> None:
     folders = ":".join(path.translate(escaped) for path in lower)
     options = f"lowerdir={folders},upperdir={upper},workdir={inner},userxattr"
     kernel.mount("copy-on-write", path, "overlay", _PLAIN, options)
-
-
-def _mount_links(snapshot: str) -> None:
-    os.mkdir(f"{_SCRATCH}/work", 0o700)
-    _bind(f"{_SCRATCH}/work", WORK)
-    for name in os.listdir(snapshot):
-        os.symlink(f"{snapshot}/{name}", f"{WORK}/{name}")
 
 
 def _mirror_folders(source: str, target: str) -> None:

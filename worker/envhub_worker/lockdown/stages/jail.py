@@ -130,16 +130,12 @@ def process_limit(limits: Limits, namespaced: bool) -> int:
     """Returns a runner's ``RLIMIT_NPROC``; it counts the user's threads in the user namespace."""
     if namespaced:
         return limits.processes + 1  # init
-    return limits.processes + _threads_of(os.getuid())
-
-
-def _threads_of(uid: int) -> int:
     threads = 0
     for pid in procfs.pids():
         with contextlib.suppress(OSError):
-            if os.stat(f"/proc/{pid}").st_uid == uid:
+            if os.stat(f"/proc/{pid}").st_uid == os.getuid():
                 threads += len(os.listdir(f"/proc/{pid}/task"))
-    return threads
+    return limits.processes + threads
 
 
 def _leave_the_zygote() -> None:

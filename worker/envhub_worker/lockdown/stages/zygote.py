@@ -15,7 +15,7 @@ import os
 import pwd
 import signal
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from functools import partial
 
 import envhub_worker
@@ -112,7 +112,11 @@ def interpreter_paths() -> list[str]:
     prefixes = [sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix]
     binaries = [os.path.dirname(sys.executable), os.path.dirname(os.path.realpath(sys.executable))]
     folders = [*filter(os.path.isabs, sys.path), *_editable_paths()]
-    return [*prefixes, *binaries, *folders, package, *_mapped_folders()]
+    # folders of loaded shared libraries: nix and conda interpreters bring theirs
+    with open("/proc/self/maps") as maps:
+        mapped = {line.split(maxsplit=5)[5].rstrip("\n") for line in maps if "/" in line}
+    libraries = {os.path.dirname(path) for path in mapped if path[:1] == "/" and ".so" in path}
+    return [*prefixes, *binaries, *folders, package, *libraries]
 
 
 def _editable_paths() -> Iterator[str]:
@@ -127,13 +131,6 @@ def _editable_paths() -> Iterator[str]:
             for item in filter(os.DirEntry.is_symlink, items):
                 if item.name.endswith(suffixes) or os.path.isfile(f"{item.path}/__init__.py"):
                     yield item.path
-
-
-def _mapped_folders() -> Iterable[str]:
-    """Returns the folders of loaded shared libraries (nix and conda interpreters bring theirs)."""
-    with open("/proc/self/maps") as maps:
-        paths = {line.split(maxsplit=5)[5].rstrip("\n") for line in maps if "/" in line}
-    return {os.path.dirname(path) for path in paths if path.startswith("/") and ".so" in path}
 
 
 def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
