@@ -171,7 +171,7 @@ class JailEvents:
             elif isinstance(event, RunnerExited):
                 self._runner_exited(entry, event)
             elif isinstance(event, CallDenied):
-                self._denied(entry, event)
+                entry.denied.append(f"{event.call} {event.detail}".strip())
 
     def _runner_started(self, entry: JailRecord, event: RunnerStarted) -> None:
         entry.pids[event.runner] = event.pid
@@ -287,10 +287,7 @@ class JailEvents:
             return
         for event in events:
             if isinstance(event, CallDenied):
-                self._denied(entry, event)
-
-    def _denied(self, entry: JailRecord, event: CallDenied) -> None:
-        entry.denied.append(f"{event.call} {event.detail}".strip())
+                entry.denied.append(f"{event.call} {event.detail}".strip())
 
     def kill(self, entry: JailRecord) -> None:
         """Start to end a jail's processes; ``jail_gone`` follows when all have ended."""

@@ -227,7 +227,10 @@ class RemoteGate(Gate):
         for session in sessions:
             clients.of(self._label_of(session.key)).sessions += 1
         for entry in self.jails.open_ones():
-            clients.of(self._label_of(_key_of(entry))).add_jail(entry)
+            share = clients.of(self._label_of(_key_of(entry)))
+            share.jails += 1
+            share.runners += len(entry.links)
+            share.memory_limit_bytes += entry.jail.spec.confinement.limits.memory_bytes
         for client_key in {session.key for session in sessions}:
             share = clients.of(self._label_of(client_key))
             share.upload_bytes += self._uploads.used_bytes(client_key)

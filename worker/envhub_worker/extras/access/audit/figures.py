@@ -22,7 +22,6 @@ from envhub_worker.extras.access.quotas import Rules
 from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import printable
-from envhub_worker.supervisor.records import JailRecord
 
 MAX_CLIENTS = 256
 """Most clients with figures of their own; all further ones share one entry."""
@@ -185,18 +184,12 @@ def look_at(pid: int) -> Process | None:
     try:
         words = procfs.stat(pid)
         spent = (int(words[_USER]) + int(words[_SYSTEM])) / _TICKS_A_S
-        resident = int(words[_RESIDENT]) * _PAGE
-        started = int(words[_STARTED])
-        return Process(pid, started, spent, _share(pid, resident))
+        memory = int(words[_RESIDENT]) * _PAGE
+        with contextlib.suppress(OSError):  # its share, where a shared page counts for its owners
+            memory = procfs.numbers(f"/proc/{pid}/smaps_rollup").get(b"Pss", memory)
+        return Process(pid, int(words[_STARTED]), spent, memory)
     except (OSError, ValueError, IndexError):
         return None
-
-
-def _share(pid: int, resident: int) -> int:
-    """Returns a process's proportional memory: a shared page is divided among its owners."""
-    with contextlib.suppress(OSError):
-        return procfs.numbers(f"/proc/{pid}/smaps_rollup").get(b"Pss", resident)
-    return resident
 
 
 @dataclass
@@ -213,12 +206,6 @@ class Client:
     inflight_bytes: int = 0
     opened: int = 0
     requests: dict[str, int] = field(default_factory=dict)
-
-    def add_jail(self, entry: JailRecord) -> None:
-        """Count an open jail."""
-        self.jails += 1
-        self.runners += len(entry.links)
-        self.memory_limit_bytes += entry.jail.spec.confinement.limits.memory_bytes
 
 
 class ClientFigures:

@@ -236,7 +236,13 @@ class Uploads:
             return
         with self._alone() as alone:
             if alone:
-                self._remove_unused(store, in_use)
+                keep = {sha256 for offer in self._offered(store) for sha256 in offer.needed}
+                store.remove_unlinked(keep)
+                for digest in store.unused(in_use):
+                    if self._fits(store):
+                        return
+                    store.remove(digest)
+                    store.remove_unlinked(keep)
         if not self._fits(store):
             raise RefusedError(
                 "WorkerError",
@@ -245,15 +251,6 @@ class Uploads:
                 f"{MAX_TREES}; the others are used by open environments, or uploaded by other "
                 "processes of yours",
             )
-
-    def _remove_unused(self, store: BlobStore, in_use: Collection[str]) -> None:
-        keep = {sha256 for offer in self._offered(store) for sha256 in offer.needed}
-        store.remove_unlinked(keep)
-        for digest in store.unused(in_use):
-            if self._fits(store):
-                return
-            store.remove(digest)
-            store.remove_unlinked(keep)
 
     def _fits(self, store: BlobStore) -> bool:
         trees = store.trees + len(self._offered(store))
