@@ -225,21 +225,16 @@ def _distinct(keys: list[Any]) -> list[Any]:
     lossy = _LOSSY | {getattr(sys.modules.get("numpy"), "ndarray", tuple)}
     for key in keys:
         if key.__class__ in lossy:
-            key = key if _is_hashable(key) else inert_copy(key)
+            try:
+                hash(key)
+            except TypeError:
+                key = inert_copy(key)
             seen[key] += 1
             if seen[key] > 1:
                 same = key if isinstance(key, RemoteObject) else inert_copy(key)
                 key = RemoteObject(same.type_name, f"{same.text} #{seen[key]}")
         elements.append(key)
     return elements
-
-
-def _is_hashable(key: object) -> bool:
-    try:
-        hash(key)
-    except TypeError:
-        return False
-    return True
 
 
 def _read_scalar(decoder: Decoder, payload: bytes) -> object:

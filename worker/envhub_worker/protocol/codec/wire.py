@@ -161,18 +161,6 @@ def _read_long(document: bytes, position: int, limits: WireLimits) -> tuple[int,
 
     For a text, binary or extension returns -1 and the position after its content.
     """
-    kind, length, position = _read_length(document, position)
-    if kind <= _ARRAY:
-        return (2 * length if kind == _MAP else length), position
-    if kind == _TEXT and length > limits.text_bytes:
-        raise MessageTooLargeError(
-            f"A text of {length} bytes is over {limits.text_bytes} (text_bytes)."
-        )
-    return -1, position + length
-
-
-def _read_length(document: bytes, position: int) -> tuple[int, int, int]:
-    """Returns kind, declared length, and the position of the content or first element."""
     first = document[position]
     if first not in _LENGTHS:
         raise RemoteProtocolError("The header is not msgpack.")
@@ -181,11 +169,17 @@ def _read_length(document: bytes, position: int) -> tuple[int, int, int]:
     if length_bytes:
         length = int.from_bytes(document[position : position + length_bytes], "big")
         position += length_bytes
+    if kind <= _ARRAY:
+        return (2 * length if kind == _MAP else length), position
+    if kind == _TEXT and length > limits.text_bytes:
+        raise MessageTooLargeError(
+            f"A text of {length} bytes is over {limits.text_bytes} (text_bytes)."
+        )
     if kind == _EXT:
         if document[position : position + 1] == b"\xff":
             raise RemoteProtocolError("The header holds a msgpack timestamp.")
         position += 1
-    return kind, length, position
+    return -1, position + length
 
 
 def _refuse_container(items: int, depth: int, limits: WireLimits) -> NoReturn:

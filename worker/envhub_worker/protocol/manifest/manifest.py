@@ -268,12 +268,13 @@ def read_spec_facts(value: object) -> dict[str, Any] | None:
     if value is None:
         return None
     facts = string_keys(value, "spec")
-    return {name: read(facts[name], name) for name, read in _FACTS.items() if name in facts}
+    known = {name: facts[name] for name in _FACTS if name in facts}
+    return {
+        name: None if fact is None else _FACTS[name](fact, name) for name, fact in known.items()
+    }
 
 
-def _optional_whole(value: object, name: str) -> int | None:
-    if value is None:
-        return None
+def _whole(value: object, name: str) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
         raise RemoteProtocolError(f"{name} is not a whole number")
     if not -(1 << 63) <= value < 1 << 63:
@@ -281,25 +282,23 @@ def _optional_whole(value: object, name: str) -> int | None:
     return int(value)
 
 
-def _optional_number(value: object, name: str) -> float | None:
-    if value is None:
-        return None
+def _number(value: object, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, _NUMBERS):
         raise RemoteProtocolError(f"{name} is not a number")
     if isinstance(value, (float, np.floating)):
         return float(value)
-    return _optional_whole(value, name)
+    return _whole(value, name)
 
 
-def _optional_flag(value: object, name: str) -> bool | None:
-    if value is not None and not isinstance(value, (bool, np.bool_)):
+def _flag(value: object, name: str) -> bool:
+    if not isinstance(value, (bool, np.bool_)):
         raise RemoteProtocolError(f"{name} is neither true nor false")
-    return None if value is None else bool(value)
+    return bool(value)
 
 
 _FACTS: dict[str, Callable[[object, str], object]] = {
-    "id": optional_name,
-    "max_episode_steps": _optional_whole,
-    "reward_threshold": _optional_number,
-    "nondeterministic": _optional_flag,
+    "id": checked_name,
+    "max_episode_steps": _whole,
+    "reward_threshold": _number,
+    "nondeterministic": _flag,
 }

@@ -328,8 +328,12 @@ def _members(infos: dict[Any, Any], key: Any, count: int) -> Any:
     if value is None:
         return members
     if isinstance(value, dict):
-        names = [name for name in value if not _is_mask(name, value)]
-        columns = {name: _members(value, name, count) for name in names}
+        columns = {
+            name: _members(value, name, count)
+            for name in value
+            # all but masks
+            if not (type(name) is str and name[:1] == "_" and name[1:] in value)
+        }
         value = [
             {name: column[index] for name, column in columns.items() if _has(value, name, index)}
             for index in range(count)
@@ -338,10 +342,6 @@ def _members(infos: dict[Any, Any], key: Any, count: int) -> Any:
         if _has(infos, key, index):
             members[index] = value[index]
     return members
-
-
-def _is_mask(name: Any, infos: dict[Any, Any]) -> bool:
-    return type(name) is str and name[:1] == "_" and name[1:] in infos
 
 
 def _has(infos: dict[Any, Any], key: Any, index: int) -> bool:
