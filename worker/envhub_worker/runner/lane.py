@@ -167,7 +167,10 @@ class Lane:
             length = self._asked[slabs.MESSAGE]
             return self._run_message(length) if length else self._run_step()
         except BaseException as error:
-            frame = _raised_frame(self._raised(error, "step"))
+            message = self._raised(error, "step")
+            [frame] = m.pack(message)
+            if len(frame) > slabs.INFO_BYTES:  # then it goes without its traceback
+                [frame] = m.pack(m.replace(message, traceback=""))
             if (self._watched or self._warned) and self._has_more_to_say():
                 self.unsent = [frame]
                 return slabs.FETCH, 0
@@ -360,14 +363,6 @@ class ColumnLane(Lane):
 def _arrays_in(view: Any) -> list[Any]:
     """A list of the numbers, each an array of its own."""
     return [view[index, ...].copy() for index in range(len(view))]
-
-
-def _raised_frame(message: m.RaisedException) -> Any:
-    """Encodes an exception, without its traceback if that does not fit."""
-    [frame] = m.pack(message)
-    if len(frame) > slabs.INFO_BYTES:
-        [frame] = m.pack(m.replace(message, traceback=""))
-    return frame
 
 
 class InfoWriter:

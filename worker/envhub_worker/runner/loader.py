@@ -24,12 +24,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from envhub_worker.protocol.messages import CONFIG_CLASS, Load, LoadTask
-from envhub_worker.runner.gymnasium_compat import (
-    Parameters,
-    parameters_of,
-    restore_numpys_names,
-    takes,
-)
+from envhub_worker.runner import gymnasium_compat as compat
 
 
 class ConfigMapping(dict[str, Any]):
@@ -123,7 +118,7 @@ def import_entry(snapshot: str, entry: str, scratch: str) -> Callable[..., Any]:
     root = Path(snapshot)
     folder, parts = _package_of(root, path)
     _make_importable(root, root / path.parent, scratch, folder)
-    restore_numpys_names()
+    compat.restore_numpys_names()
     module = importlib.import_module(".".join([PACKAGE, *parts]))
     make_env = getattr(module, "make_env", None)
     if not callable(make_env):
@@ -146,10 +141,10 @@ def call_make_env(make_env: Callable[..., Any], request: Load | LoadTask) -> Any
     offered: dict[str, Any] = {"n_envs": request.n_envs, "use_async_envs": request.use_async_envs}
     if request.cfg is not None:
         offered["cfg"] = config_of(request.cfg)
-    parameters = parameters_of(make_env)
+    parameters = compat.parameters_of(make_env)
     if parameters is None:
         return make_env(**offered, **request.env_kwargs)
-    taken = {name: value for name, value in offered.items() if takes(parameters, name)}
+    taken = {name: value for name, value in offered.items() if compat.takes(parameters, name)}
     _check_arguments(parameters, taken, request.env_kwargs)
     return make_env(**(taken | request.env_kwargs))
 
@@ -195,9 +190,9 @@ def _make_importable(root: Path, folder: Path, scratch: str, package_path: Path)
 
 
 def _check_arguments(
-    parameters: Parameters, taken: dict[str, Any], arguments: dict[str, Any]
+    parameters: compat.Parameters, taken: dict[str, Any], arguments: dict[str, Any]
 ) -> None:
-    unknown = [name for name in arguments if not takes(parameters, name)]
+    unknown = [name for name in arguments if not compat.takes(parameters, name)]
     if unknown:
         raise ArgumentsError(
             f"make_env takes no {', '.join(unknown)}; it takes {', '.join(parameters) or 'nothing'}"

@@ -33,8 +33,9 @@ def describe(tasks: list[Task]) -> Manifest:
     sides: Sides = {}
     for task in tasks:
         envs.append(_describe_task(task, sides))
-        if len(tasks) > 1:
-            task.forget_probe()  # a suite must not hold an environment of every task
+        if len(tasks) > 1 and task.probe is not None:
+            task.probe.close()  # a suite must not hold an environment of every task
+            task.probe = None
     return Manifest(envs=tuple(envs), lazy=lazy, interpreter=_interpreter(), packages=_packages())
 
 

@@ -26,16 +26,7 @@ import gymnasium as gym
 from envhub_worker.protocol.codec.inert import type_name
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
-from envhub_worker.protocol.messages.prefix import (
-    CHANGES,
-    MAX_ATTRIBUTE,
-    MAX_TEXT,
-    SHARED_CATEGORY,
-    WARNINGS,
-    WATCHED_TYPES,
-    Attribute,
-    RemoteWarning,
-)
+from envhub_worker.protocol.messages import prefix
 from envhub_worker.protocol.text import printable
 from envhub_worker.runner.sync_envs import SubEnvs
 
@@ -51,8 +42,8 @@ class WarningLog:
     """Collects warnings. ``pending``, always the same list: those that no reply has carried yet."""
 
     def __init__(self) -> None:
-        self.pending: list[RemoteWarning] = []
-        self._heard: set[RemoteWarning] = set()  # each goes out once
+        self.pending: list[prefix.RemoteWarning] = []
+        self._heard: set[prefix.RemoteWarning] = set()  # each goes out once
 
     def listen(self) -> None:
         """Collect every warning that any thread shows from now on."""
@@ -74,14 +65,14 @@ class WarningLog:
 
     def note_shared(self, name: str) -> None:
         """Warn that sub-environments share state, which has this name in ``SHARED_STATE``."""
-        self.pending.append((SHARED_CATEGORY, name))
+        self.pending.append((prefix.SHARED_CATEGORY, name))
 
     def _note(self, message: object, category: type) -> None:
         if len(self._heard) >= _MOST:
             return
         try:
             text = _COLORS.sub("", str(message)[:_KEPT])
-            warning = (type_name(category), printable(text, _KEPT)[:MAX_TEXT])
+            warning = (type_name(category), printable(text, _KEPT)[: prefix.MAX_TEXT])
         except Exception:  # it has no text
             return
         if warning not in self._heard:
@@ -92,9 +83,9 @@ class WarningLog:
         """Puts the pending warnings in front of a reply's frames."""
         if not self.pending or len(frames) >= DEFAULT_LIMITS.frames:
             return frames
-        some = self.pending[: WARNINGS.most]
+        some = self.pending[: prefix.WARNINGS.most]
         del self.pending[: len(some)]
-        return WARNINGS.put(some, frames)
+        return prefix.WARNINGS.put(some, frames)
 
 
 _SEARCHES: frozenset[Any] = frozenset(
@@ -127,8 +118,8 @@ class Watches:
 
     def __init__(self, alone: Callable[[], bool] = is_alone) -> None:
         self._alone = alone
-        self.readings: dict[Attribute, list[_Reading]] = {}
-        self.changed: dict[Attribute, None] = {}
+        self.readings: dict[prefix.Attribute, list[_Reading]] = {}
+        self.changed: dict[prefix.Attribute, None] = {}
 
     def begin(self, number: int, env: Any, name: str, values: Any | None) -> bool:
         """Watch an attribute whose values were just read; returns whether that is possible.
@@ -137,7 +128,7 @@ class Watches:
         key = (number, name)
         self.readings.pop(key, None)
         self.changed.pop(key, None)
-        if len(self.readings) >= CHANGES.most or not self._alone():
+        if len(self.readings) >= prefix.CHANGES.most or not self._alone():
             return False
         if not _can_be_watched(env, name, values):
             return False
@@ -170,16 +161,16 @@ class Watches:
         """
         if not self.changed or len(frames) >= DEFAULT_LIMITS.frames:
             return frames
-        keys = list(self.changed)[: CHANGES.most]
+        keys = list(self.changed)[: prefix.CHANGES.most]
         for key in keys:
             del self.changed[key]
-        return CHANGES.put(keys, frames)
+        return prefix.CHANGES.put(keys, frames)
 
 
 def _can_be_watched(env: Any, name: str, values: Any) -> bool:
-    if not isinstance(env, SubEnvs) or len(name) > MAX_ATTRIBUTE:
+    if not isinstance(env, SubEnvs) or len(name) > prefix.MAX_ATTRIBUTE:
         return False
-    if not all(type(value) in WATCHED_TYPES for value in values or ()):
+    if not all(type(value) in prefix.WATCHED_TYPES for value in values or ()):
         return False
     wanted = None if values is None else True
     try:

@@ -114,12 +114,6 @@ class Task:
         assert self.recording is not None
         return old_gym.adapted(self.recording.env_fns[index]())
 
-    def forget_probe(self) -> None:
-        """Close the sub-environment that ``learn_spaces`` built."""
-        if self.probe is not None:
-            self.probe.close()
-            self.probe = None
-
 
 def _itself(env: Any) -> Any:
     return env
@@ -137,7 +131,10 @@ def tasks_of(result: Any, n_envs: int, use_async_envs: bool, again: EnvFn) -> li
     """
     make = _Maker(n_envs, use_async_envs, again)
     if not isinstance(result, Mapping):
-        return [make.task(_suite_name(result), 0, result, lambda value: value)]
+        is_known = isinstance(result, (gym.Env, VectorEnv)) or old_gym.is_env(result)
+        spec = getattr(result, "spec", None) if is_known else None
+        suite = str(getattr(spec, "id", None) or "hub_env")
+        return [make.task(suite, 0, result, lambda value: value)]
     tasks = [make.task(suite, task, env, pick) for suite, task, env, pick in _entries(result)]
     if not tasks:
         raise ResultError("make_env returned an empty mapping, without an environment")
@@ -270,12 +267,6 @@ def _is_batched(env: Any, count: int) -> bool:
 
 
 _SPACES = ("observation_space", "action_space")
-
-
-def _suite_name(env: Any) -> str:
-    is_known = isinstance(env, (gym.Env, VectorEnv)) or old_gym.is_env(env)
-    spec = getattr(env, "spec", None) if is_known else None
-    return str(getattr(spec, "id", None) or "hub_env")
 
 
 def _described(value: Any) -> str:

@@ -111,20 +111,18 @@ class SharedState:
 
     def _scopes(self) -> Iterator[tuple[tuple[str, ...], object]]:
         """Yields the attributes of each compared module, and of each class in it."""
-        for name, module in list(sys.modules.items()):
-            if self._is_looked_at(name, module):
+        modules: dict[str, Any] = dict(sys.modules)  # which may hold anything
+        for name, module in modules.items():
+            if not isinstance(module, ModuleType):
+                continue
+            file = vars(module).get("__file__")
+            ours = isinstance(file, str) and file.startswith(self._root)
+            if ours or name.partition(".")[0] in self.packages:
                 own = dict(vars(module))
                 yield ("module", name), _plain(own)
                 for key, value in own.items():
                     if isinstance(value, type) and value.__module__ == name:
                         yield ("module", name, key), _plain(dict(vars(value)))
-
-    def _is_looked_at(self, name: str, module: Any) -> bool:
-        if not isinstance(module, ModuleType):
-            return False
-        file = vars(module).get("__file__")
-        ours = isinstance(file, str) and file.startswith(self._root)
-        return ours or name.partition(".")[0] in self.packages
 
 
 def _plain(attributes: dict[str, Any]) -> dict[str, object]:
