@@ -51,7 +51,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.umask(0o022)
     argv = sys.argv[1:] if argv is None else argv
     parser, names = _parser(all_commands=argv[:1] != ["serve"])
-    _check_command(parser, names, argv)
+    if argv and argv[0] not in names:
+        import difflib
+
+        near = difflib.get_close_matches(argv[0], names, 1)
+        if near:
+            parser.error(f"there is no command {argv[0]!r}; did you mean {near[0]!r}?")
     arguments = parser.parse_args(argv)
     run: Callable[[argparse.Namespace], int] = arguments.run
     return run(arguments)
@@ -84,17 +89,6 @@ def _parser(*, all_commands: bool) -> tuple[argparse.ArgumentParser, list[str]]:
     if all_commands:
         _add_others(commands)
     return parser, list(commands.choices)
-
-
-def _check_command(parser: argparse.ArgumentParser, names: list[str], argv: Sequence[str]) -> None:
-    """Suggest a command for a mistyped one."""
-    if not argv or argv[0] in names:
-        return
-    import difflib
-
-    near = difflib.get_close_matches(argv[0], names, 1)
-    if near:
-        parser.error(f"there is no command {argv[0]!r}; did you mean {near[0]!r}?")
 
 
 def _add_others(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -64,7 +64,9 @@ def why_file_unwritable(error: BaseException, root: str) -> str:
     place = _place(path, root)
     if not place or os.access(path, os.W_OK):
         return ""
-    if os.path.exists(path) and not _is_read_only(path):
+    folder = os.path.dirname(path)
+    makes_files = os.access(folder, os.W_OK | os.X_OK)
+    if os.path.exists(path) and makes_files and not os.statvfs(folder).f_flag & os.ST_RDONLY:
         return (
             f"{path} is shared and has mode {os.stat(path).st_mode & 0o777:04o}. os.replace() puts "
             "another file there, and os.chmod(path, 0o755) makes it this jail's own, to be written "
@@ -113,10 +115,3 @@ def _distribution(path: str) -> str:
 
 def _within(path: str, folder: str) -> bool:
     return path.startswith(os.path.abspath(folder).rstrip(os.sep) + os.sep)
-
-
-def _is_read_only(path: str) -> bool:
-    """Whether no file can be made or removed in the file's folder."""
-    folder = os.path.dirname(path)
-    read_only = os.statvfs(folder).f_flag & os.ST_RDONLY
-    return bool(read_only) or not os.access(folder, os.W_OK | os.X_OK)

@@ -39,6 +39,9 @@ _QUOTAS: dict[str, tuple[tuple[str, ...], str, str]] = {
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of ``listen``."""
+    # A container is a layer itself, and often forbids the others. A jail of that profile runs as
+    # our user, so it needs Landlock, which hides our keys and stores.
+    contained = any(map(os.path.exists, _CONTAINER_MARKS)) and landlock.version() >= 1
     parser.add_argument(
         "--max-connections",
         type=_count,
@@ -92,7 +95,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--weakest-profile",
         choices=PROFILES,
-        default=_weakest_profile(),
+        default="container" if contained else "strict",
         help="the weakest profile that a client's policy may name (default here: %(default)s)",
     )
     parser.add_argument(
@@ -181,12 +184,3 @@ def _at_least(least: int, text: str) -> int:
 
 
 _count, _seconds = partial(_at_least, 1), partial(_at_least, 0)
-
-
-def _weakest_profile() -> str:
-    """Returns ``container`` in a container, which is a layer itself and often forbids the others.
-
-    A jail of that profile runs as our user, so it needs Landlock, which hides our keys and stores.
-    """
-    contained = any(map(os.path.exists, _CONTAINER_MARKS)) and landlock.version() >= 1
-    return "container" if contained else "strict"
