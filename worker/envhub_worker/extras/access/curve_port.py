@@ -118,29 +118,19 @@ class CurvePort:
         # From the last frame: libzmq 4.3.4 has no metadata of the first one.
         header = router.recv(zmq.NOBLOCK, copy=False)
         rest = receive(router) if header.more else []
-        frames = [header.bytes, *rest]
-        return Incoming(identity, self._key_of(header), frames, _descriptor_of(header))
-
-    def _key_of(self, frame: zmq.Frame) -> bytes:
-        if self._keys is None:
-            return ANYBODY
-        try:
-            return bytes.fromhex(str(frame.get("User-Id")))
-        except (zmq.ZMQError, ValueError):
-            return b""
+        key, fd = b"" if self._keys else ANYBODY, -1
+        with contextlib.suppress(zmq.ZMQError, ValueError):
+            fd = int(header.get(zmq.SRCFD))
+        if self._keys is not None:
+            with contextlib.suppress(zmq.ZMQError, ValueError):
+                key = bytes.fromhex(str(header.get("User-Id")))
+        return Incoming(identity, key, [header.bytes, *rest], fd)
 
     def close(self) -> None:
         """Close the sockets of the handshakes."""
         self.connections.close()
         if self._zap is not None:
             self._zap.close()
-
-
-def _descriptor_of(frame: zmq.Frame) -> int:
-    try:
-        return int(frame.get(zmq.SRCFD))
-    except (zmq.ZMQError, ValueError):
-        return -1
 
 
 class ConnectionLimiter:
