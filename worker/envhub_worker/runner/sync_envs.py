@@ -463,22 +463,16 @@ def _reward_shape(env: Any) -> tuple[int, ...]:
 
 def _writer(space: gym.Space[Any], leaves: Iterator[Any]) -> Store:
     """Returns a function that writes a member of the space into row ``index`` of the leaves."""
-    if isinstance(space, spaces.Dict):
-        by_key = [(key, _writer(sub, leaves)) for key, sub in space.spaces.items()]
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        parts: Any = space.spaces
+        items = parts.items() if isinstance(space, spaces.Dict) else enumerate(parts)
+        writers = [(key, _writer(sub, leaves)) for key, sub in items]
 
-        def write_dict(index: int, member: Any) -> None:
-            for key, write in by_key:
+        def write_parts(index: int, member: Any) -> None:
+            for key, write in writers:
                 write(index, member[key])
 
-        return write_dict
-    if isinstance(space, spaces.Tuple):
-        in_order = [_writer(sub, leaves) for sub in space.spaces]
-
-        def write_tuple(index: int, member: Any) -> None:
-            for position, write in enumerate(in_order):
-                write(index, member[position])
-
-        return write_tuple
+        return write_parts
     return _leaf_writer(next(leaves))
 
 
