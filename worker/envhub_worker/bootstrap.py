@@ -6,7 +6,7 @@ bring a ``worker.py`` of its own. So this file loads the package from its own fo
     python -I .../bootstrap.py worker ARGS...    envhub_worker.__main__.main(ARGS)
     python -s .../bootstrap.py zygote ARGS...    envhub_worker.spawn.zygote.main(ARGS)
     python -I .../bootstrap.py probe             envhub_worker.lockdown.probe.main([])
-    python -I -S .../bootstrap.py bytecode PATH  envhub_worker.bytecode.main([PATH])
+    python -I -S .../bootstrap.py bytecode PATH  envhub_worker.extras.bytecode.main
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _PROGRAMS = {
     "worker": "envhub_worker.__main__",
     "zygote": "envhub_worker.spawn.zygote",
     "probe": "envhub_worker.lockdown.probe",
-    "bytecode": "envhub_worker.bytecode",
+    "bytecode": "envhub_worker.extras.bytecode",
 }
 
 _NEEDED = {

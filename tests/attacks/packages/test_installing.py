@@ -233,7 +233,7 @@ ESCAPED = """\
 import runpy, socket, sys
 bootstrap = runpy.run_path(sys.argv[1])
 bootstrap["load_package"]()
-from envhub_worker import bytecode
+from envhub_worker.extras import bytecode
 if sys.argv[2] == "confined":
     bytecode.confine_to_bytecode_folder(sys.argv[3])
 def attempt(work):

@@ -88,7 +88,6 @@ MAY_IMPORT = {
     "envhub_worker.lockdown": {""},
     "envhub_worker.runner": {"file_access", "find_extra", "lockdown"},
     "envhub_worker.bootstrap": set(),
-    "envhub_worker.bytecode": {"lockdown"},
     "envhub_worker.loop": set(),
     "envhub_worker.file_access": set(),
     "envhub_worker.find_extra": set(),
@@ -96,6 +95,7 @@ MAY_IMPORT = {
     "envhub_worker": set(),
     "envhub_worker.extras": set(),
     "envhub_worker.extras.access": {"", "lockdown", "loop", "server", "supervisor"},
+    "envhub_worker.extras.bytecode": {"lockdown"},
     "envhub_worker.extras.denials": {"lockdown"},
     "envhub_worker.extras.old_gym": {"runner"},
 }
