@@ -254,7 +254,8 @@ def surroundings() -> Surroundings:
     """Returns the confinement around this process, which must be single-threaded."""
     lines = Path("/proc/self/status").read_text().splitlines()
     status = {name: value.strip() for name, _, value in (line.partition(":") for line in lines)}
-    held = (int(status[f"Cap{name}"], 16) for name in ("Inh", "Prm", "Eff", "Bnd", "Amb"))
+    sets = ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")
+    held = (int(status[name], 16) for name in sets)
     return Surroundings(
         profiles=tuple(profiles(probe()["layers"], landlock.version())),
         landlock=landlock.version(),
