@@ -11,7 +11,7 @@ import contextlib
 import hashlib
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import lru_cache, partial
 from pathlib import Path
@@ -276,7 +276,12 @@ class EnvFactory:
 
         seats = list(zip(self._launchers, bounds))  # noqa: B905 - there may be more places
         if self._num_workers is None and not trials.may_share(env):
-            seats = [seat for launcher, rows in seats for seat in _each(launcher, *rows)]
+            # a worker for each sub-environment, in the same sandbox
+            seats = [
+                (launcher if index == start else launcher.another(), (index, index + 1))
+                for launcher, (start, stop) in seats
+                for index in range(start, stop)
+            ]
         recorder = recorder_for(self._repository.policy.crash_history)
         unnoted = ShardTrials(None)  # one shard each: there is nothing to try
         parts = [
@@ -284,12 +289,6 @@ class EnvFactory:
             for launcher, rows in seats
         ]
         return FleetSession(parts, recorder)
-
-
-def _each(launcher: Launcher, start: int, stop: int) -> Iterator[tuple[Launcher, tuple[int, int]]]:
-    """Yield one worker for each sub-environment, all in the same sandbox."""
-    for index in range(start, stop):
-        yield launcher if index == start else launcher.another(), (index, index + 1)
 
 
 def _close_all(shared: SharedJails) -> None:

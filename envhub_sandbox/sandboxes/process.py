@@ -131,7 +131,7 @@ class LocalServer(WorkerServer):
         cleaner of temporary files has removed its sockets, nobody can connect.
         """
         alive = self.process.poll() is None and not has_ended(self.process.pid)
-        return alive and self._runtime.has_sockets(*self._sockets)
+        return alive and all((self.folder / name).is_socket() for name in self._sockets)
 
     def stop(self) -> None:
         """End the server and remove its folder; interruption.md, rule 7."""
@@ -265,10 +265,6 @@ class RuntimeFolder:
         except BaseException:
             shutil.rmtree(self.path, ignore_errors=True)
             raise
-
-    def has_sockets(self, *names: str) -> bool:
-        """Whether all these sockets exist; a cleaner may remove temporary files that look old."""
-        return all((self.path / name).is_socket() for name in names)
 
     def remove(self) -> None:
         """Remove the folder and its contents. Idempotent."""

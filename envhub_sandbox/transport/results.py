@@ -203,7 +203,7 @@ class Results:
     def _is_own(self, name: str, part: Any) -> bool:
         """Whether our own vector environments return such an array, so that it can be joined."""
         if name != "rewards":
-            return _flags(part)
+            return isinstance(part, np.ndarray) and part.dtype.kind == "b" and part.ndim == 1
         # AsyncVectorEnv permits several rewards for each sub-environment
         return bool(part.ndim == 1 or not self.manifest.sync)
 
@@ -236,8 +236,3 @@ def is_batch(part: Any) -> bool:
 def _numeric(part: Any) -> bool:
     """Whether this is a batch of numbers or booleans, as a tensor always is."""
     return is_batch(part) and (not isinstance(part, np.ndarray) or part.dtype.kind in "biuf")
-
-
-def _flags(part: Any) -> bool:
-    """Whether this is an array of booleans in one dimension."""
-    return isinstance(part, np.ndarray) and part.dtype.kind == "b" and part.ndim == 1

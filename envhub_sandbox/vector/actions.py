@@ -80,8 +80,13 @@ def _batch_of_arrays(
             f"{name}: expected {dtype} of shape {shape} for {space} in {places}, "
             f"got {array.dtype} of shape {array.shape}"
         )
-    # an environment in this process would see the caller's own numbers
-    return list(value) if _is_listed(value, array) else _native(array)
+    if _is_listed(value, array):
+        return list(value)  # an environment in this process would see the caller's own numbers
+    if array.dtype in _DTYPES:
+        return array
+    # the same numbers in a dtype that can be sent: native byte order, at most 64 bits
+    wide = array.dtype.itemsize > np.dtype(np.float64).itemsize
+    return array.astype(np.float64 if wide else array.dtype.newbyteorder("="))
 
 
 @batch_of.register(spaces.Dict)
@@ -253,14 +258,6 @@ def _is_listed(value: Any, array: Any) -> bool:
             return False
         value = [part for item in value for part in item]
     return all(type(item) is kind for item in value)
-
-
-def _native(array: Any) -> Any:
-    """The same numbers in a dtype that can be sent: native byte order, at most 64 bits."""
-    if array.dtype in _DTYPES:
-        return array
-    wide = array.dtype.itemsize > np.dtype(np.float64).itemsize
-    return array.astype(np.float64 if wide else array.dtype.newbyteorder("="))
 
 
 def _kinds_for(space: gym.Space[Any]) -> frozenset[str]:

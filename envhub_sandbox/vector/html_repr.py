@@ -32,29 +32,22 @@ def environment_html(env: Any, layers: Iterable[Mapping[str, Any]], rendered: An
         name = str(layer.get("layer"))
         held[name] = held.get(name, True) and bool(layer.get("enforced"))
     names = [name for name, holds in held.items() if holds]
+    confined = f"{counted(len(names), 'layer')}: {', '.join(names)}"
     rows = [
         ("environments", env.num_envs),
         ("observations", env.single_observation_space),
         ("actions", env.single_action_space),
         ("state", "closed" if env.closed else "open"),
-        ("confined by", _counted(names) if names else "(it does not run now)"),
+        ("confined by", confined if names else "(it does not run now)"),
     ]
     body = "".join(
         f"<tr><th>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in rows
     )
-    return f"<code>{_text(repr(env))}</code><table>{body}</table>{_picture(rendered)}"
-
-
-def _counted(layers: list[str]) -> str:
-    return f"{counted(len(layers), 'layer')}: {', '.join(layers)}"
-
-
-def _picture(rendered: Any) -> str:
-    """The HTML of a frame as a small picture; empty if this is not a frame."""
+    page = f"<code>{_text(repr(env))}</code><table>{body}</table>"
     if not is_frame(rendered):
-        return ""
+        return page
     data = base64.b64encode(png(small_picture(rendered, _SIDE))).decode()
-    return f'<img alt="The last frame" src="data:image/png;base64,{data}">'
+    return f'{page}<img alt="The last frame" src="data:image/png;base64,{data}">'
 
 
 def suites_html(suites: Mapping[Any, Mapping[Any, Any]]) -> str:

@@ -45,13 +45,10 @@ def free_memory_bytes(proc: Path = Path("/proc")) -> int | None:
     The control group of this process, or one around it, may have fewer bytes left than the machine,
     such as that of a container or of a service.
     """
-    free = [_of_machine(proc / "meminfo"), *map(_of_group, _groups(proc / "self"))]
+    kilobytes = _fields(proc / "meminfo").get("MemAvailable:")
+    of_machine = None if kilobytes is None else kilobytes * 1024
+    free = [of_machine, *map(_of_group, _groups(proc / "self"))]
     return min((size for size in free if size is not None), default=None)
-
-
-def _of_machine(meminfo: Path) -> int | None:
-    kilobytes = _fields(meminfo).get("MemAvailable:")
-    return None if kilobytes is None else kilobytes * 1024
 
 
 def _of_group(folder: Path) -> int | None:

@@ -140,11 +140,8 @@ def stale_groups(root: Path) -> Iterator[Leftover]:
     folders = {path for level in ("", "*/", "*/*/") for path in root.glob(f"{level}envhub_*")}
     for folder in sorted(folders):
         with contextlib.suppress(OSError):
-            if _GROUP.fullmatch(folder.name) and _is_deserted_group(folder):
+            processes = folder / "cgroup.procs"
+            used = processes.exists() and processes.read_text()
+            ours = _GROUP.fullmatch(folder.name) and os.access(folder, os.W_OK)
+            if ours and not used and not is_held(folder):
                 yield Leftover("control group", str(folder))
-
-
-def _is_deserted_group(folder: Path) -> bool:
-    processes = folder / "cgroup.procs"
-    used = processes.exists() and processes.read_text()
-    return not used and os.access(folder, os.W_OK) and not is_held(folder)

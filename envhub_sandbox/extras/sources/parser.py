@@ -81,16 +81,6 @@ def bound() -> None:
         signal.signal(signal.SIGPROF, signal.SIG_DFL)
 
 
-def begin_file() -> None:
-    """Limit the time for the next file: CPU time, or the clock's time on a platform that does not
-    count CPU time.
-    """
-    if sys.platform == "win32":
-        faulthandler.dump_traceback_later(CPU_S, exit=True)  # its thread needs no other thread
-    else:
-        signal.setitimer(signal.ITIMER_PROF, CPU_S)
-
-
 def described(data: bytes) -> dict[str, Any] | None:
     """Returns a file's content; {} if this Python cannot parse it, None if it costs too much."""
     named = encoding(data)
@@ -520,7 +510,11 @@ def main() -> None:
     warnings.simplefilter("ignore")  # a warning of the parser's would show a stranger's lines
     while head := sys.stdin.buffer.read(4):
         data = sys.stdin.buffer.read(int.from_bytes(head, "big"))
-        begin_file()
+        # limit the CPU time of the next file, or the clock's where CPU time is not counted
+        if sys.platform == "win32":
+            faulthandler.dump_traceback_later(CPU_S, exit=True)  # its thread needs no other thread
+        else:
+            signal.setitimer(signal.ITIMER_PROF, CPU_S)
         line = json.dumps(described(data))
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()
