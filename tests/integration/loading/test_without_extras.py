@@ -43,7 +43,8 @@ _ASKED = [
     ("assets", ["org/data"], "assets", "sources.assets"),
 ]
 """An argument, a value that needs an extra, how the error calls it, and the extra's module."""
-_RECORD = ["policy", {"record_denials": True}]
+_OF_WORKER = [("denials", {"record_denials": True}), ("display", {"display": "virtual"})]
+"""An extra of the worker, and a policy that needs it."""
 
 
 @pytest.fixture(scope="module")
@@ -78,14 +79,16 @@ def alone(core: Path, program: str, *arguments: str, code: int = 0) -> str:
 
 def test_the_core_needs_no_extra(core: Path) -> None:
     """It makes an environment; what a caller asks for beyond that is named."""
-    asked = [*((argument, value) for argument, value, _, _ in _ASKED), _RECORD]
+    asked = [(argument, value) for argument, value, _, _ in _ASKED]
+    asked += [("policy", policy) for _, policy in _OF_WORKER]
     printed = alone(core, _CALLS, sample("cartpole"), json.dumps(asked)).splitlines()
-    shape, *refused, record = printed[-2 - len(_ASKED) :]
+    shape, *refused = printed[-1 - len(asked) :]
     assert shape == "(2,)"
-    assert [line.partition(", which this")[0] for line in refused] == [
+    assert [line.partition(", which this")[0] for line in refused[: len(_ASKED)]] == [
         f"{what} needs envhub_sandbox.extras.{module}" for _, _, what, module in _ASKED
     ]
-    assert "installed without envhub_worker.extras.denials" in record
+    for line, (name, _) in zip(refused[len(_ASKED) :], _OF_WORKER, strict=True):
+        assert f"installed without envhub_worker.extras.{name}" in line
 
 
 def test_the_commands_of_the_core_run(core: Path, checkout: Path) -> None:

@@ -82,7 +82,7 @@ MAY_IMPORT = {
     "envhub_sandbox.extras.starter": {"cli"},
     "envhub_sandbox.extras.wheel_builder": {"factory", "hub", "sandboxes", "session"},
     "envhub_worker.__main__": {"find_extra", "server"},
-    "envhub_worker.server": {"", "lockdown", "loop", "spawn", "supervisor"},
+    "envhub_worker.server": {"", "find_extra", "lockdown", "loop", "spawn", "supervisor"},
     "envhub_worker.supervisor": {"lockdown", "loop", "spawn"},
     "envhub_worker.spawn": {"bootstrap", "find_extra", "lockdown"},
     "envhub_worker.lockdown": {""},
@@ -94,10 +94,15 @@ MAY_IMPORT = {
     "envhub_worker.protocol": set(),
     "envhub_worker": set(),
     "envhub_worker.extras": set(),
-    "envhub_worker.extras.access": {"", "lockdown", "loop", "server", "supervisor"},
+    "envhub_worker.extras.access": {
+        *("", "extras.surroundings", "lockdown", "loop", "server", "supervisor")
+    },
     "envhub_worker.extras.bytecode": {"lockdown"},
     "envhub_worker.extras.denials": {"lockdown"},
+    "envhub_worker.extras.display": {"lockdown"},
+    "envhub_worker.extras.lerobot_stub": set(),
     "envhub_worker.extras.old_gym": {"runner"},
+    "envhub_worker.extras.surroundings": {"", "lockdown"},
 }
 # beyond the table: what a module or a package must know nothing of
 IGNORANT = {
@@ -125,10 +130,10 @@ IMPORTERS = {
     "envhub_sandbox.system.extras": "our own extras",
     "envhub_sandbox.sandboxes.inprocess": "the repository's, where sandbox=None trusts it",
     "envhub_worker.bootstrap": "our own programs",
+    "envhub_worker.extras.lerobot_stub": "LeRobot's, where it is installed in a jail",
     "envhub_worker.find_extra": "our own extras",
     "envhub_worker.runner.loader": "the repository's",
     "envhub_worker.runner.returned": "nothing but 'raise error', in the place of a line",
-    "envhub_worker.spawn.preparations": "LeRobot's, where it is installed in a jail",
     "envhub_worker.spawn.runner_entry": "the program of a runner, which the server names",
     "envhub_worker.spawn.zygote": "a list of our own",
 }

@@ -16,6 +16,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from envhub_worker.find_extra import find_extra
+
 if TYPE_CHECKING:
     from envhub_worker.spawn.zygote_process import ZygoteProcess
 
@@ -65,9 +67,10 @@ def _serve_in(arguments: argparse.Namespace) -> int:
     gc.enable()
     announced = None
     if arguments.announce:
-        from envhub_worker.lockdown import probe
-
-        announced = probe.announcement(probe.surroundings())
+        surroundings = find_extra("surroundings")
+        if surroundings is None:
+            sys.exit("--announce needs envhub_worker.extras.surroundings, which is not installed")
+        announced = surroundings.announcement(surroundings.measure())
     server = Server(
         arguments.endpoint,
         arguments.runtime_dir,

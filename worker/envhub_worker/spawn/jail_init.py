@@ -119,12 +119,17 @@ class Init:
 
     def _set_up(self, message: dict[str, Any], fds: list[int]) -> None:
         spec = JailSpec.from_wire(message["spec"])
-        if spec.confinement.record_denials and evidence is None:
-            raise LayerUnavailableError(
-                "record_denials",
-                "this worker is installed without envhub_worker.extras.denials",
-                "Install the whole package, or leave out record_denials.",
-            )
+        confinement = spec.confinement
+        for option, wanted, extra, name in (
+            ("record_denials", confinement.record_denials, evidence, "denials"),
+            ("display", confinement.display != "none", runner_entry.display, "display"),
+        ):
+            if wanted and extra is None:
+                raise LayerUnavailableError(
+                    option,
+                    f"this worker is installed without envhub_worker.extras.{name}",
+                    f"Install the whole package, or leave out {option}.",
+                )
         events, *joins = fds or [-1]  # in the order of ``Group.open``
         layers = plan(
             spec.confinement,

@@ -24,15 +24,21 @@ import traceback
 from collections.abc import Callable
 from typing import NoReturn
 
+from envhub_worker.find_extra import find_extra
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.layers import Layer, LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import process, reap
 from envhub_worker.lockdown.mechanisms.environment import jail_environment
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import runner
-from envhub_worker.spawn import blas, preparations
+from envhub_worker.spawn import blas
 from envhub_worker.spawn.channel import Channel
 
+# Loaded before this process is confined, when it can still read its own files.
+display, lerobot_stub = find_extra("display"), find_extra("lerobot_stub")
+
+_GRANTED = ("HF_HOME", "HF_HUB_CACHE", "HUGGINGFACE_HUB_CACHE")
+"""Variables by which a caller gives another cache to the jail."""
 _SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
 
 
@@ -73,12 +79,42 @@ def _run(jail: JailContext, fds: list[int], init: Channel, runners: int) -> int:
     blas.restore_threads(jail.common.set_blas_threads, runners)
     init.send({"report": [_SELF_TEST.to_wire()]})
     init.close()
-    preparations.make_hub_cache(jail.spec)
-    preparations.install_lerobot_stub()
-    preparations.start_display(jail.spec)
+    make_hub_cache(jail.spec)
+    if lerobot_stub is not None:
+        lerobot_stub.install()
+    if display is not None:
+        display.start(jail.spec)
     main = _main(jail, runners)  # not before init is out of reach: packages may be a stranger's
     stream = socket.socket(fileno=fds[0])
     return int(main(stream, jail.spec, fds[1:]) or 0)
+
+
+def make_hub_cache(spec: JailSpec) -> None:
+    """Lay out a cache of the Hub in the jail's home. All runners of a jail make the same cache.
+
+    It has huggingface_hub's layout: for each repository a folder with ``refs/main``, which names
+    the commit, and ``snapshots/COMMIT``, which is a link to the files. ``HF_HUB_OFFLINE`` (see
+    ``lockdown.mechanisms.environment``) makes ``snapshot_download`` and ``hf_hub_download`` look
+    there and nowhere else.
+    """
+    if any(name in spec.confinement.environment for name in _GRANTED):
+        return
+    for copy in spec.hub_copies:
+        folder = f"{os.environ['HF_HOME']}/hub/{copy.folder}"
+        for revision in copy.revisions:
+            _write(f"{folder}/refs/{revision}", copy.commit)
+        os.makedirs(f"{folder}/snapshots", exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            os.symlink(copy.tree or spec.snapshot, f"{folder}/snapshots/{copy.commit}")
+
+
+def _write(path: str, text: str) -> None:
+    """Write a whole file at once: the runners of a jail share their home and do this together."""
+    os.makedirs(os.path.dirname(path), exist_ok=True)
+    draft = f"{path}.{os.getpid()}.draft"
+    with open(draft, "w") as file:
+        file.write(text)
+    os.replace(draft, path)
 
 
 def _main(
@@ -121,7 +157,8 @@ def confine(jail: JailContext, fds: list[int], init: Channel) -> None:
     descriptors = {0, 1, 2, init.fileno(), *fds}
     process.close_all_but({*descriptors, *jail.view.shared.values()})
     _forget_the_zygote(jail)
-    preparations.check_display(jail.spec, os.environ)
+    if display is not None:  # without it, init has refused a policy that asks for one
+        display.check(jail.spec, os.environ)
     runner.enter(jail, descriptors, lambda listener: init.send({"broker": True}, [listener]))
 
 
@@ -187,9 +224,5 @@ def _make_environment(environment: str, folder: str) -> None:
     for path, target in links.items():
         with contextlib.suppress(FileExistsError):
             os.symlink(target, path)
-    # The runners of a jail share their home and do this at once: each step gives the same result,
-    # and the last file appears as a whole.
-    draft = f"{environment}/{os.getpid()}.draft"
-    with open(draft, "w") as file:
-        file.write(f"home = {os.path.dirname(base)}\ninclude-system-site-packages = false\n")
-    os.replace(draft, f"{environment}/pyvenv.cfg")
+    home = os.path.dirname(base)
+    _write(f"{environment}/pyvenv.cfg", f"home = {home}\ninclude-system-site-packages = false\n")

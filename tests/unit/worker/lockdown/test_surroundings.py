@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from envhub_worker.extras import surroundings
 from envhub_worker.extras.access.commands import health
-from envhub_worker.lockdown import probe
 from envhub_worker.protocol.confinement import Surroundings
 from envhub_worker.protocol.runtime import OWN, Runtime
 
@@ -33,7 +33,7 @@ def layers(*names: str) -> list[dict[str, object]]:
 def test_the_strongest_profile_is_the_one_whose_layers_are_there(
     there: tuple[str, ...], abi: int, expected: str | None
 ) -> None:
-    assert next(iter(probe.profiles(layers(*there), abi)), None) == expected
+    assert next(iter(surroundings.profiles(layers(*there), abi)), None) == expected
 
 
 @pytest.mark.parametrize(
@@ -64,17 +64,17 @@ def test_limits_are_read_from_either_kind_of_control_group(
         for name, text in files[root].items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_text(f"{text}\n")
-        readers = probe.memory_limit, probe.pids_limit, probe.cpus_limit
+        readers = surroundings.memory_limit, surroundings.pids_limit, surroundings.cpus_limit
         assert tuple(read(folder) for read in readers) == expected
 
 
 def test_the_network_is_what_the_kernel_lists() -> None:
     table = "Inter-|   Receive\n face |bytes\n    lo:  0 0\n  eth0: 12 3\n"
-    assert probe.network_devices(table) == ["lo", "eth0"]
+    assert surroundings.network_devices(table) == ["lo", "eth0"]
 
 
 def test_the_announcement_is_one_line_of_json() -> None:
-    said = probe.announcement(probe.surroundings(), server_key="00")
+    said = surroundings.announcement(surroundings.measure(), server_key="00")
     assert "\n" not in said
     found = vars(Surroundings.read(json.loads(said)))
     assert set(json.loads(said)) == {"envhub-worker", "server_key", *found}
@@ -82,10 +82,10 @@ def test_the_announcement_is_one_line_of_json() -> None:
 
 def test_a_derived_image_brings_its_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of servers for clients on other hosts, too, who cannot name one; else it is the server's."""
-    monkeypatch.setattr(probe, "ENVIRONMENT", tmp_path / "python")
-    assert probe.own_runtime() == OWN
+    monkeypatch.setattr(surroundings, "ENVIRONMENT", tmp_path / "python")
+    assert surroundings.own_runtime() == OWN
     (tmp_path / "python").touch()
-    assert probe.own_runtime() == Runtime(str(tmp_path / "python"))
+    assert surroundings.own_runtime() == Runtime(str(tmp_path / "python"))
 
 
 @pytest.mark.parametrize(("greeting", "healthy"), [(b"\xff", True), (b"H", False), (b"", False)])

@@ -11,12 +11,13 @@ from pathlib import Path
 import pytest
 from huggingface_hub import snapshot_download
 
+from envhub_worker.extras import lerobot_stub
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.messages import CONFIG_CLASS
 from envhub_worker.protocol.runtime import HubCopy
 from envhub_worker.runner.loader import config_of
-from envhub_worker.spawn.preparations import install_lerobot_stub, make_hub_cache
+from envhub_worker.spawn.runner_entry import make_hub_cache
 
 COMMIT = "ab" * 20
 
@@ -56,7 +57,7 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     before = list(sys.meta_path)
     for name in [one for one in sys.modules if one.partition(".")[0] == "lerobot"]:
         monkeypatch.delitem(sys.modules, name)
-    install_lerobot_stub()
+    lerobot_stub.install()
     yield
     sys.meta_path[:] = before
     for name in [one for one in sys.modules if one.partition(".")[0] == "lerobot"]:

@@ -22,7 +22,7 @@ from envhub_worker.extras.access.packages import Packages
 from envhub_worker.extras.access.places import Drain, Places
 from envhub_worker.extras.access.quotas import InFlight, Rules, check_policy, use_of
 from envhub_worker.extras.access.store.uploads import PREFIX, Uploads, wrong_with_path
-from envhub_worker.lockdown.probe import own_runtime
+from envhub_worker.extras.surroundings import own_runtime
 from envhub_worker.lockdown.spec import confinement_from_wire
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m

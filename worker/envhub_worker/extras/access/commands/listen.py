@@ -23,6 +23,7 @@ from typing import Any
 import zmq
 
 from envhub_worker import __version__
+from envhub_worker.extras import surroundings
 from envhub_worker.extras.access.audit.log import FORMS, Log
 from envhub_worker.extras.access.commands.identity import (
     Identity,
@@ -64,10 +65,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _listen(arguments: argparse.Namespace, state: Path) -> int:
     check_bind(arguments.bind, arguments.insecure_loopback)
-    around = probe.surroundings() if arguments.announce else None
+    around = surroundings.measure() if arguments.announce else None
     if arguments.dependencies and (why := why_impossible()):
         raise UsageError(f"--dependencies: {why}")
-    strongest = probe.profiles(probe.probe()["layers"], landlock.version())
+    strongest = surroundings.profiles(probe.probe()["layers"], landlock.version())
     identity = replace(identity_of(arguments, state), profile=(*strongest, "strict")[0])
     log = Log(form=FORMS[arguments.log_format], level=arguments.log_level)
     why = unusable(identity.profile, arguments.weakest_profile)
@@ -138,7 +139,7 @@ def _announce(
             os.write(arguments.ready_fd, f"{endpoint} {identity.public}\n".encode())
         os.close(arguments.ready_fd)
     elif around is not None:
-        print(probe.announcement(around, server_key=identity.public), flush=True)
+        print(surroundings.announcement(around, server_key=identity.public), flush=True)
     elif arguments.log_format == "text" or identity.authorized is None:  # a client needs the key
         print(announcement(endpoint, identity), flush=True)
 
