@@ -70,7 +70,7 @@ def test_only_what_was_given_reaches_the_policy() -> None:
     assert (read["cfg"], "output" in read["policy"]) == ("org/repo", False)
     zeros = {"memory_bytes": "0", "disk_bytes": "0", "processes": 0, "cpu_time_s": 0}
     for name, zero in zeros.items():
-        with pytest.raises(PolicyError, match="above 0"):
+        with pytest.raises(PolicyError, match="is 0; it takes a whole number"):
             policy_from(options(**{name: zero}).arguments()["policy"], None)
 
 
