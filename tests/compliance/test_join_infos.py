@@ -61,8 +61,8 @@ NUMBERS = st.sampled_from([1, 2, 0.5, True, 2**60 + 1, np.int64(300), np.int8(3)
 ARRAYS = st.sampled_from([np.ones(2), np.ones(2, np.int8), np.ones((2, 1)), np.ones((0, 2))])
 ALIKE = st.fixed_dictionaries({"array": ARRAYS, "inner": st.fixed_dictionaries({"n": NUMBERS})})
 NUMBER = st.fixed_dictionaries({"number": NUMBERS})
-WORDS = ["text", None, Decimal("2.5"), Decimal(0), Fraction(7, 2)]
-ANY = st.sampled_from([1, 0.5, True, np.float64(0.1), np.array(None), np.ones(2), {}, *WORDS])
+OBJECTS = ["text", None, Decimal("2.5"), Decimal(0), Fraction(7, 2)]
+ANY = st.sampled_from([1, 0.5, True, np.float64(0.1), np.array(None), np.ones(2), {}, *OBJECTS])
 UNLIKE = st.tuples(INFO, st.fixed_dictionaries({}, optional={"number": NUMBERS, "any": ANY}))
 
 
@@ -90,10 +90,11 @@ def test_shards_join_as_one_batch(infos: list[dict[str, Any]], data: st.DataObje
         assert_same(expected, results.infos(parts))
 
 
-def test_structures_are_tuples_in_every_row() -> None:
-    """Also in rows without the key, however the sub-environments are cut into shards."""
+def test_values_that_the_wire_changes_are_joined_alike() -> None:
+    """A column of numbers makes numbers of other objects; structures are tuples in every row."""
     structure = np.dtype([("a", np.int64), ("b", np.float32)])
-    one = [{}, {"x": np.array((1, 2.5), structure), "y": np.array([(3, 4)], structure)}, {}]
+    one: list[Any] = [{"d": 1}, {"d": Decimal("2.5")}, {"d": True}]
+    one[1] |= {"x": np.array((1, 2.5), structure), "y": np.array([(3, 4)], structure)}
     space = spaces.Discrete(2)
     results = Results(wire.env_manifest(space, space, 3), [(0, 1), (1, 3)])
     infos = results.infos([sent(one[:1]), sent(one[1:])])
