@@ -42,6 +42,7 @@ from envhub_sandbox.system.platform import (
     OwnerProcess,
     boot_id,
     has_ended,
+    own_cpus,
     pidfd,
     readable_within,
     user_id,
@@ -169,9 +170,13 @@ class ProcessSandbox(Sandbox):
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
     ) -> ServerUse[LocalServer]:
-        """Use the server of this process; start it if there is none."""
+        """Use the server of this process; start it if there is none.
+
+        A server's jails have the cores that this program had when the server started. If it has
+        others now, it gets another server.
+        """
         check_platform()
-        return self._pool.acquire(store, partial(_start, store, runtime), idle_s)
+        return self._pool.acquire((store, *own_cpus()), partial(_start, store, runtime), idle_s)
 
 
 def check_platform() -> None:

@@ -69,12 +69,12 @@ def homes_of(path: Path) -> list[Path]:
     return [Path(os.path.realpath(home)) for home in homes if os.path.isabs(home)]
 
 
-def cores() -> int:
-    """The number of processors that this process may use."""
-    count = os.cpu_count() or 1
+def own_cpus() -> list[int]:
+    """The cores that this thread may use now; a program may restrict them after its imports."""
+    cpus = list(range(os.cpu_count() or 1))
     if sys.platform == "linux":
-        count = len(os.sched_getaffinity(0))
-    return count
+        cpus = sorted(os.sched_getaffinity(0))
+    return cpus
 
 
 def boot_id() -> str:

@@ -18,9 +18,9 @@ there; one that the client waits awake for would never run there, so it avoids t
 from __future__ import annotations
 
 import ctypes
-import os
 from time import monotonic
 
+from envhub_sandbox.system.platform import own_cpus
 from envhub_worker.protocol.shared_memory.words import AVOIDED
 
 _LONGEST_WAIT_MS = 24 * 3600 * 1000
@@ -219,11 +219,6 @@ class SpinChooser:
 _ANY = [0]
 _LOOK_EVERY = 64
 """Steps between two looks at where the client runs."""
-
-
-def own_cpus() -> list[int]:
-    """The cores that this process may use now; a program may restrict them after its imports."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
 
 
 class Cores:

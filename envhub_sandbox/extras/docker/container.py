@@ -20,7 +20,7 @@ from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.process import CONTAINER, LocalServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
-from envhub_sandbox.system.platform import cores, pidfd, readable_within, user_id
+from envhub_sandbox.system.platform import own_cpus, pidfd, readable_within, user_id
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
@@ -160,7 +160,7 @@ class RepositoryContainer(Sandbox):
         sockets.mkdir(mode=0o700)
         user, group = _user(sockets)
         return replace(
-            self.wanted(folder, run_arguments.seccomp_profile(), cores()),
+            self.wanted(folder, run_arguments.seccomp_profile(), len(own_cpus())),
             sockets=str(sockets),
             snapshot=str(self.snapshot),
             packages=self.packages,

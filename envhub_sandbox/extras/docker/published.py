@@ -33,7 +33,7 @@ from envhub_sandbox.extras.remote.sandbox import RemoteServer
 from envhub_sandbox.extras.remote.tcp import TcpServer, new_keys
 from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.process import CONTAINER, RuntimeFolder, remove_stale
-from envhub_sandbox.system.platform import OwnerProcess, cores, each_after_fork, own_group
+from envhub_sandbox.system.platform import OwnerProcess, each_after_fork, own_cpus, own_group
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
@@ -71,7 +71,7 @@ class PublishedContainer(RepositoryContainer):
             # the engine's processors, not ours, are those of the virtual machine
             seccomp = seccomp_profile(self.engine.machine or None)
             wanted = replace(
-                self.wanted(container.folder.path, seccomp, self.engine.cpus or cores()),
+                self.wanted(container.folder.path, seccomp, self.engine.cpus or len(own_cpus())),
                 only_client=key_text(public),
                 profile=self.policy.profile,
             )

@@ -13,8 +13,9 @@ from typing import Any
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.system.log import MESSAGES
+from envhub_sandbox.system.platform import own_cpus
 from envhub_sandbox.transport.connection import Source
-from envhub_sandbox.transport.deadline import Cores, Deadline, SpinChooser, own_cpus
+from envhub_sandbox.transport.deadline import Cores, Deadline, SpinChooser
 from envhub_sandbox.transport.jail import Frames
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import RunnersDiedError, typed_reply

@@ -12,6 +12,7 @@ from envhub_sandbox.sandboxes.pool import stop_idle
 from tests.faults.remains.clients import finish, is_clean, left, line, start
 from tests.faults.remains.traces import temporary_root
 from tests.support.processes import descendants, eventually
+from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
 _ONLY_SERVER = 3  # the server, and its zygote's two
@@ -61,6 +62,31 @@ def test_it_goes_when_its_time_has_come() -> None:
     used(600)
     assert _servers()
     stop_idle()
+
+
+_TELLING = """
+import os
+
+class Telling(Still):
+    def cores(self):
+        return sorted(os.sched_getaffinity(0))
+"""
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="this machine has a single core")
+def test_a_program_that_has_fewer_cores_now_gets_another(tmp_path: Path) -> None:
+    """New processes of an environment have the cores of the program, as if it had forked them."""
+    folder, every = write_repository(tmp_path, STILL + _TELLING), os.sched_getaffinity(0)
+    seen = []
+    try:
+        for own in (every, {max(every)}):
+            os.sched_setaffinity(0, own)
+            with make_env(folder) as suites:
+                seen.append(set(suites.env.call("cores")[0]))
+    finally:
+        os.sched_setaffinity(0, every)
+        stop_idle()
+    assert seen == [every, {max(every)}]
 
 
 def test_a_suite_that_is_not_closed_holds_it() -> None:
