@@ -163,8 +163,8 @@ class SandboxVecEnv(VecEnv):
         for index in ended:
             begun = infos[index]
             last = begun.pop("final_info", {})
-            last["terminal_observation"] = begun.pop("final_obs")
             last["TimeLimit.truncated"] = begun.pop("TimeLimit.truncated")
+            last["terminal_observation"] = begun.pop("final_obs")
             infos[index], self.reset_infos[index] = last, begun
 
     def close(self) -> None:

@@ -101,7 +101,7 @@ def here() -> DummyVecEnv:
 
 def form(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: form(one) for key, one in value.items() if key not in _DESCRIBED}
+        return [(key, form(one)) for key, one in value.items() if key not in _DESCRIBED]
     if isinstance(value, (list, tuple)):
         return type(value), [form(one) for one in value]
     if isinstance(value, (np.ndarray, np.generic)):
