@@ -96,18 +96,3 @@ class JailContext:
     processes: int
     measured: bool
     joins: list[int]
-
-
-@dataclass(frozen=True, kw_only=True)
-class OwnPaths:
-    """The paths that a jail's processes may use.
-
-    Attributes:
-        changed: Folders and files that the processes may change.
-        read: Folders and files that they may read.
-        scratch: Folders in which they may have created symbolic links.
-    """
-
-    changed: tuple[str, ...] = ()
-    read: tuple[str, ...] = ()
-    scratch: tuple[str, ...] = ()

@@ -39,16 +39,14 @@ from envhub_worker.lockdown.limits.watchdog import Watchdog
 from envhub_worker.lockdown.mechanisms import process, procfs, reap
 from envhub_worker.lockdown.plan import plan
 from envhub_worker.lockdown.seccomp import notify
-from envhub_worker.lockdown.seccomp.syscalls import NAMED
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import jail
-from envhub_worker.lockdown.stages.runner import runner_paths
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.spawn import runner_entry
 from envhub_worker.spawn.channel import Channel, close_fds
 
 # Loaded before this process is confined, when it can still read its own files.
-evidence = find_extra("denials")
+denials = find_extra("denials.recorder")
 
 
 def run(control: int, output: int, common: Common) -> NoReturn:
@@ -99,7 +97,7 @@ class Init:
         self._common = common
         self._runners: dict[int, _Runner] = {}  # by pid; those that are not reaped yet
         self._listeners: set[int] = set()  # where the runners' filters ask what they do not decide
-        self._denials: set[tuple[str, str]] = set()  # reported already
+        self._recorder: Any = None  # of denied attempts, if the policy asks for it
         self._running = True  # False once the channel has ended, or at SIGTERM
         self._poller = select.poll()
 
@@ -121,7 +119,7 @@ class Init:
         spec = JailSpec.from_wire(message["spec"])
         confinement = spec.confinement
         for option, wanted, extra, name in (
-            ("record_denials", confinement.record_denials, evidence, "denials"),
+            ("record_denials", confinement.record_denials, denials, "denials"),
             ("display", confinement.display != "none", runner_entry.display, "display"),
         ):
             if wanted and extra is None:
@@ -149,6 +147,8 @@ class Init:
             measured=not message["cgroup"],
             joins=joins,
         )
+        if confinement.record_denials and denials is not None:
+            self._recorder = denials.Recorder(self._jail, self._report_denied)
         self._watchdog = Watchdog(self._jail, events)
         report = [layer.to_wire() for layer in (*layers, jail.working_view(view))]
         self._channel.send({"event": "ready", "report": report})
@@ -233,31 +233,17 @@ class Init:
             os.close(listener)
 
     def _note(self, request: notify.Request) -> None:
-        """Report a denied attempt, each kind once; ignores attempts of a runner's self-test."""
+        """Record an attempt, but none of a runner's self-test."""
+        if self._recorder is None:
+            return
         # Its report may still wait in the channel although it runs a stranger's code by now.
         self._read_report(request.caller)
         runner = self._runners.get(request.caller)
-        if runner is not None and runner.status is not None:
-            return
-        call = request.call
-        if call not in NAMED or call not in self._common.watched:
-            detail = notify.detail(request)
-            if detail or not notify.is_own_affair(call, self._common.watched):
-                self._report_denied(call, detail)
-            return
-        assert evidence is not None  # see ``_set_up``
-        mine = runner_paths(self._jail, request.caller, request.thread)
-        waits = request.still_waits
-        for deed, path in evidence.asked(call, request.words, request.thread, mine, waits):
-            self._report_denied(deed, path)
+        if runner is None or runner.status is None:
+            self._recorder.note(request)
 
     def _report_denied(self, call: str, detail: str) -> None:
-        denial, kind = (call, detail), notify.kind(detail)
-        if denial in self._denials:
-            return
-        if sum(notify.kind(other) == kind for _, other in self._denials) < notify.MOST_OF_A_KIND:
-            self._denials.add(denial)
-            self._channel.send({"event": "denied", "call": call, "detail": detail})
+        self._channel.send({"event": "denied", "call": call, "detail": detail})
 
     def _read_report(self, pid: int) -> None:
         """Read a runner's report of its confinement, if ``pid`` still owes one."""

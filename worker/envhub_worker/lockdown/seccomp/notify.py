@@ -16,15 +16,13 @@ import fcntl
 import os
 import select
 import signal
-import socket
 import struct
 from collections.abc import Callable, Collection
 from functools import partial
 
 from envhub_worker.lockdown.mechanisms import kernel, procfs
 from envhub_worker.lockdown.seccomp.policy import WITHOUT_ATTRIBUTES, refusal
-from envhub_worker.lockdown.seccomp.syscalls import NAMING, PRETENDED, c_int, syscall_name
-from envhub_worker.lockdown.seccomp.targets import OTHER, is_another_target
+from envhub_worker.lockdown.seccomp.syscalls import c_int, syscall_name
 from envhub_worker.protocol.records import dataclass
 
 _RECEIVE = 0xC0502100  # SECCOMP_IOCTL_NOTIF_RECV
@@ -66,9 +64,7 @@ _PROCEED = -1
 """In the place of an errno: the kernel makes the call itself. Not None, which is what a path would
 answer that forgets to."""
 _Inside = Callable[[], Collection[int]]
-_SIGNALS = ("kill", "tkill", "tgkill")
-_NETLINKS = (0, 15)
-"""Of addresses and of devices: what the C library and what looks for devices asks."""
+SIGNALS = ("kill", "tkill", "tgkill")
 
 
 def serve(listener: int, permitted: Collection[str], note: Callable[[Request], None]) -> bool:
@@ -94,7 +90,7 @@ def serve(listener: int, permitted: Collection[str], note: Callable[[Request], N
     note(request)  # before the caller goes on: what it did is known when it is looked for
     if call in permitted and call not in WITHOUT_ATTRIBUTES:
         answer = _PROCEED
-    elif call in _SIGNALS:
+    elif call in SIGNALS:
         answer = decide(request, partial(procfs.descendants, os.getpid()))
     else:
         answer = refusal(call)
@@ -103,37 +99,6 @@ def serve(listener: int, permitted: Collection[str], note: Callable[[Request], N
         # The caller may have ended meanwhile: then nobody waits for an answer.
         fcntl.ioctl(listener, _SEND, _ANSWER.pack(identity, 0, result, flags))
     return True
-
-
-MOST_OF_A_KIND = 32
-"""Different denials that are reported of a jail, of files, of sockets and of other calls each: a
-flood of one kind hides no attempt of another."""
-
-
-def kind(detail: str) -> str:
-    """Returns the kind of a denied call, by its detail."""
-    return next((begin for begin in ("/", "AF_") if detail.startswith(begin)), "")
-
-
-def detail(request: Request) -> str:
-    """Returns the scalar arguments that are safe to report, such as the family of a socket."""
-    call = request.call
-    if call in NAMING and is_another_target(call, request.arguments, request.caller, os.getpid()):
-        return OTHER
-    if call not in ("socket", "socketpair"):
-        return ""
-    family, _, protocol = request.arguments
-    try:
-        name = socket.AddressFamily(family).name
-    except ValueError:
-        return "AF_UNKNOWN"
-    is_known = family != socket.AF_NETLINK or protocol in _NETLINKS
-    return name if is_known else f"{name}_OTHER"
-
-
-def is_own_affair(call: str, permitted: Collection[str]) -> bool:
-    """Whether a call that targets the jail's own processes is nothing to report."""
-    return call in permitted or call in PRETENDED or call in _SIGNALS
 
 
 def _has_callers(listener: int) -> bool:

@@ -15,7 +15,7 @@ import socket
 from collections.abc import Callable, Iterable
 from functools import partial
 
-from envhub_worker.lockdown.context import JailContext, OwnPaths
+from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import kernel, landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import LandlockRule
@@ -109,7 +109,7 @@ def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
     own = f"/proc/{pid}"
     own_files = [f"{own}/{name}" for name in _OWN_FILES.split()]
     readable += ["/proc", "/etc", "/dev"] if common.namespaced else [*_HOST_FILES, *own_files]
-    writable = _writable(jail)
+    writable = writable_folders(jail)
     # CUDA writes thread names there and fails (error 304) if it cannot. With a pid namespace, /proc
     # has the jail's processes only. Without one the runner may write below its own folder only, so
     # child processes cannot name their threads.
@@ -126,21 +126,11 @@ def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
     ]
 
 
-def _writable(jail: JailContext) -> list[str]:
+def writable_folders(jail: JailContext) -> list[str]:
+    """Returns the folders that the processes of a jail may write."""
     scratch = jail.scratch
     shared = [] if scratch.shared_memory is None else [scratch.shared_memory]
     return [scratch.home, scratch.temporary, scratch.work, *shared, *jail.view.shared]
-
-
-def runner_paths(jail: JailContext, pid: int, thread: int) -> OwnPaths:
-    """Returns the paths that a process may change and read, under the names that it sees."""
-    streams = ("/dev/fd", "/dev/stdin", "/dev/stdout", "/dev/stderr")
-    itself = ("/proc/self", "/proc/thread-self", f"/proc/{pid}", f"/proc/{thread}")
-    scratch = tuple(_writable(jail))
-    terminals = (TERMINALS, "/dev/ptmx") if jail.common.namespaced else ()
-    changed = (*scratch, *jail.common.root.devices, *terminals, *streams, *itself)
-    read = (*jail.common.root.trees, jail.spec.snapshot, *changed)
-    return OwnPaths(changed=changed, read=read, scratch=scratch)
 
 
 def resource_limits(limits: Limits, processes: int | None) -> dict[int, tuple[int, int]]:

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.extras.denials import asked
-from envhub_worker.lockdown.context import OwnPaths
-from envhub_worker.lockdown.seccomp.targets import is_another_target, never_a_target
+from envhub_worker.extras.denials.paths import OwnPaths, asked
+from envhub_worker.extras.denials.targets import is_another_target, never_a_target
 
 _OWN = OwnPaths(changed=("/sandbox/work", "/dev/null"), read=("/home/me/python",))
 _HERE = -100 & 0xFFFFFFFFFFFFFFFF

@@ -16,9 +16,9 @@ import struct
 from collections.abc import Callable, Collection, Sequence
 from typing import BinaryIO
 
-from envhub_worker.lockdown.context import OwnPaths
+from envhub_worker.extras.denials.targets import never_a_target
 from envhub_worker.lockdown.seccomp.syscalls import NAMED, c_int
-from envhub_worker.lockdown.seccomp.targets import never_a_target
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import printable
 
 _LONGEST_PATH = 4096
@@ -49,6 +49,21 @@ _FLAGS_OF_AT = {"fchmodat2": 3, "utimensat": 3, "fchownat": 4}
 _FOLLOWING = "creat truncate chmod fchmodat chown setxattr removexattr"
 _HARMLESS = ("/var/run/nscd/socket", "/run/nscd/socket")
 """The C library asks there who a user is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnPaths:
+    """The paths that a jail's processes may use.
+
+    Attributes:
+        changed: Folders and files that the processes may change.
+        read: Folders and files that they may read.
+        scratch: Folders in which they may have created symbolic links.
+    """
+
+    changed: tuple[str, ...] = ()
+    read: tuple[str, ...] = ()
+    scratch: tuple[str, ...] = ()
 
 
 def asked(

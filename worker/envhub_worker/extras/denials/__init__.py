@@ -1,0 +1,1 @@
+"""Records what a jail was denied, and which files and processes its calls name."""
