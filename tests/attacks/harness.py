@@ -25,6 +25,8 @@ from tests.support.processes import eventually
 HOSTILE = Path(__file__).with_name("hostile")
 USER = "root" if os.geteuid() == 0 else "user"
 TIMEOUTS = {"startup_s": 120.0, "call_s": 90.0, "reset_s": 90.0, "step_s": 90.0}
+_PROVED: set[tuple[str, ...]] = set()
+"""Attacks whose control has succeeded in this process: that is the same for every profile."""
 OUTSIDE, ANSWER = "outside", "by its answer"
 """Who says whether an attack succeeded: the world around the jail, or the payload."""
 Succeeded = Callable[["Run"], object]
@@ -70,6 +72,7 @@ class Attacks:
 
     inside: Callable[..., contextlib.AbstractContextManager[Run]]
     judge: Callable[..., None]
+    named: Callable[[str], tuple[str, str]]
 
     def attack(
         self,
@@ -87,6 +90,7 @@ class Attacks:
         **arguments: Any,
     ) -> None:
         """Run the payload as a control, where it must succeed, and inside, where it must not.
+        One control is for all profiles: it has none.
 
         Args:
             title: The attack's name in the table.
@@ -101,13 +105,13 @@ class Attacks:
             judged: ``ANSWER`` where ``succeeded`` has nothing but the payload's word.
             **arguments: For the payload.
         """
-        control = "not possible"
-        if not impossible:
+        control = "not possible" if impossible else "succeeds"
+        if not impossible and (*self.named(title), payload) not in _PROVED:
             before()
             with control_run(payload, arguments, secret) as run:
                 if not succeeded(run):
                     raise StoppedNowError(f"the control of {title!r} failed: {run.text[-3000:]}")
-            control = "succeeds"
+            _PROVED.add((*self.named(title), payload))
         before()
         place = {name: one for name, one in (("policy", policy), ("limits", limits)) if one}
         with self.inside(payload, {**arguments, **(inside or {})}, **place) as run:
@@ -148,6 +152,10 @@ class Arena(Attacks):
             assert not through, f"{title!r} succeeded inside ({self.profile}): {detail[-3000:]}"
         elif not through:
             raise StoppedNowError(f"{title!r} is stopped now; expectations say otherwise: {reason}")
+
+    def named(self, title: str) -> tuple[str, str]:
+        """What tells an attack from all others."""
+        return self.family, title
 
     def conditions(self) -> list[str]:
         details = [layer["detail"] for layer in self.report if layer["layer"] == "memory"]
@@ -197,6 +205,9 @@ class OpenJail(Attacks):
 
     def judge(self, title: str, *found: Any, **more: Any) -> None:
         self.arena.judge(self.prefix + title, *found, **more)
+
+    def named(self, title: str) -> tuple[str, str]:
+        return self.arena.named(self.prefix + title)
 
     @contextlib.contextmanager
     def inside(self, payload: str, arguments: Mapping[str, Any]) -> Iterator[Run]:

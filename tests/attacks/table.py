@@ -26,8 +26,8 @@ COLUMNS = (
 HEAD = """# Attacks
 
 `ENVHUB_ATTACK_TABLE=attacks.md pytest tests/attacks`, run once as a plain user and once as root,
-writes a table of every attack. Each attack runs twice in the same test: without a sandbox (the
-*control*), where it must succeed, and inside. `docs/threat-model.md` explains what is not stopped.
+writes a table of every attack. Each attack runs without a sandbox (the *control*, once for all
+profiles), where it must succeed, and inside. `docs/threat-model.md` explains what is not stopped.
 
 - **judged**: what decides whether it succeeded. *Outside*: a listener, a file, a victim process,
   the process table, the kernel's accounts, or a random token in what the repository returned. *By
