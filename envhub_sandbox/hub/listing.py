@@ -66,11 +66,9 @@ class Repository(NamedTuple):
 
 class CommitFiles(NamedTuple):
     """The files of a commit at a host, not trusted yet.
-
-    Attributes:
-        listing: The records of the files, not checked yet.
-        copier: Downloads files, with a title for errors; returns a function that copies each file
-            into the store.
+    ``listing``: the records of the files, not checked yet.
+    ``copier``: downloads files, with a title for errors; returns a function that copies each file
+    into the store.
     """
 
     listing: Iterator[FileRecord]

@@ -105,10 +105,8 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
 
     Each file's size, times and inode are compared with those recorded when its content was
     verified; if they differ, the file is hashed again. Extra and missing files are noticed.
-
-    Raises:
-        HalfDeletedError: Some files are missing.
-        SnapshotIntegrityError: The tree differs from the record; the text says how to remove it.
+    Raises ``HalfDeletedError``: some files are missing; ``SnapshotIntegrityError``: the tree
+    differs from the record; the text says how to remove it.
     """
     text = _record_of(slot)
     if text is None:

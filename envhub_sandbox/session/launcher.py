@@ -57,10 +57,8 @@ _UNKNOWN = ("server", "connection", "gone")
 @dataclass(frozen=True)
 class ExpectedManifest:
     """The manifest that a repository's ``make_env`` has returned before.
-
-    Attributes:
-        task: The environment for which the jail is opened.
-        shards: The number of runners over which the environment will be spread.
+    ``task``: the environment for which the jail is opened.
+    ``shards``: the number of runners over which the environment will be spread.
     """
 
     manifest: Manifest

@@ -40,12 +40,10 @@ def all_held(locks: Sequence[threading.RLock]) -> Iterator[None]:
 
 class UseLock:
     """The lock of one environment; its holder completes a ``close`` that came meanwhile.
-
-    Attributes:
-        lock: Held during a use. Reentrant, since a signal handler may close the environment that
-            its own thread is using.
-        flight: Held in ``send``, ``recv`` and ``reset``, and taken before ``lock``, since a
-            ``recv`` holds only the locks of workers that owe answers.
+    ``lock``: held during a use. Reentrant, since a signal handler may close the environment that
+    its own thread is using.
+    ``flight``: held in ``send``, ``recv`` and ``reset``, and taken before ``lock``, since a
+    ``recv`` holds only the locks of workers that owe answers.
     """
 
     def __init__(self, lease: Lease, failures: Failures) -> None:

@@ -53,7 +53,6 @@ class Lane:
 
     Attributes:
         name: The lane's name in a crash bundle.
-        jail, runners, number, declared: As given.
         elapsed_ns: The time of the last step, from its sending to the last answer.
     """
 
@@ -118,10 +117,8 @@ class Lane:
         """The tuple that ``VectorEnv.step`` returns.
 
         Trust: input from the worker.
-
-        Raises:
-            RemoteEnvError: The repository's code raised, or the infos cannot be joined.
-            RemoteProtocolError: A runner broke the rules.
+        Raises ``RemoteEnvError``: the repository's code raised, or the infos cannot be joined;
+        ``RemoteProtocolError``: a runner broke the rules.
         """
         # not kept, so that the next batch can use the memory of one that the caller has dropped
         answers, self._answers = self._answers, []

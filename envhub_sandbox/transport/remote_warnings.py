@@ -40,10 +40,8 @@ _NO_MORE = (
 
 class RemoteWarnings:
     """The warnings of one repository, from any of its processes.
-
-    Attributes:
-        unshown: The warnings that the caller has not seen yet. Always the same object.
-        note_shared: Called when sub-environments that share a process are not independent.
+    ``unshown``: the warnings that the caller has not seen yet. Always the same object.
+    ``note_shared``: called when sub-environments that share a process are not independent.
     """
 
     def __init__(self) -> None:

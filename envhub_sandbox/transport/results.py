@@ -29,7 +29,6 @@ class Results:
     ``bounds``: the slices of the sub-environments, in the order of the replies.
 
     Attributes:
-        manifest, bounds: As given.
         count: The number of sub-environments: all, or those of one worker of several.
         slices: The same as ``bounds``, counted from the first of these sub-environments.
         apart: Whether infos are returned as each sub-environment returned them: ``own`` and

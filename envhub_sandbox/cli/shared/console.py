@@ -283,11 +283,9 @@ _EVERY_S = 0.1
 
 class ProgressBar:
     """A progress bar; shows nothing if stderr is no terminal. A context manager.
-
-    Args:
-        quiet: Show nothing at all.
-        long_s: If stderr is no terminal, print a line about an activity after so many seconds, and
-            again each time the seconds have doubled; 0 prints none.
+    ``quiet``: show nothing at all.
+    ``long_s``: if stderr is no terminal, print a line about an activity after so many seconds, and
+    again each time the seconds have doubled; 0 prints none.
     """
 
     def __init__(self, *, quiet: bool, long_s: float = 0.0) -> None:

@@ -53,10 +53,8 @@ class ContainerOptions:
 
 class ContainerServer(LocalServer):
     """A worker server in a container that we started.
-
-    Attributes:
-        profile: The profile of its jails.
-        python: The jails' interpreter; empty for the server's own.
+    ``profile``: the profile of its jails.
+    ``python``: the jails' interpreter; empty for the server's own.
     """
 
     wanted: Container

@@ -39,10 +39,8 @@ _GROUP = re.compile(r"envhub_\d+_\w[\w-]*")
 @dataclass(frozen=True)
 class Leftover:
     """One thing that is not in use any more.
-
-    Attributes:
-        kind: ``"container"``, ``"folder"`` or ``"control group"``.
-        name: A container's name, or a path.
+    ``kind``: ``"container"``, ``"folder"`` or ``"control group"``.
+    ``name``: a container's name, or a path.
     """
 
     kind: str
@@ -71,10 +69,8 @@ class Leftover:
 
 class Found(NamedTuple):
     """The result of a search.
-
-    Attributes:
-        leftovers: The objects that can be removed.
-        unasked: The installed engines that did not answer, with the reason.
+    ``leftovers``: the objects that can be removed.
+    ``unasked``: the installed engines that did not answer, with the reason.
     """
 
     leftovers: list[Leftover]

@@ -95,10 +95,8 @@ class Member(Sandbox):
 
 class FleetPackages:
     """The packages of one repository on all places: a ``PackageTarget``. Thread-safe.
-
-    Attributes:
-        members: Returns the places of the fleet.
-        host: The runtime on this machine if no packages are made: an interpreter of this machine.
+    ``members``: returns the places of the fleet.
+    ``host``: the runtime on this machine if no packages are made: an interpreter of this machine.
     """
 
     def __init__(self) -> None:

@@ -25,10 +25,8 @@ _SHOWN = 20
 @dataclass(frozen=True)
 class ListEntry:
     """One reference of a list.
-
-    Attributes:
-        reference: The text to run and to show.
-        meaning: The normal form, equal for every spelling of the reference.
+    ``reference``: the text to run and to show.
+    ``meaning``: the normal form, equal for every spelling of the reference.
     """
 
     reference: str

@@ -143,11 +143,9 @@ _MAX_CHARS = 300
 @dataclass(frozen=True)
 class ServerPackages:
     """The packages that a server makes itself: a ``PackageTarget``.
-
-    Attributes:
-        use: Acquires the server.
-        orders: The request for each set of packages, by the server's name for the set. ``make``
-            adds to it.
+    ``use``: acquires the server.
+    ``orders``: the request for each set of packages, by the server's name for the set. ``make``
+    adds to it.
     """
 
     use: Callable[[], ServerUse[WorkerServer]]
@@ -263,10 +261,8 @@ def _facts(facts: dict[str, object], order: m.NeedPackages) -> dict[str, Any]:
 @dataclass(eq=False)
 class UploadedRepository(Sandbox):
     """The sandbox of one repository, which uploads the repository's files to a server.
-
-    Attributes:
-        order: The request for the packages that the server made; None if it made none.
-        packages: The server's name for these packages.
+    ``order``: the request for the packages that the server made; None if it made none.
+    ``packages``: the server's name for these packages.
     """
 
     snapshot: Path

@@ -80,11 +80,9 @@ def new_keys() -> tuple[bytes, bytes]:
 
 class TcpLink:
     """Watches the connection of one socket. It must be made before the socket connects.
-
-    Attributes:
-        awaited: The unanswered requests. While there are any, only the socket's owner reads the
-            monitor's events.
-        lock: A thread holds it while it adds to ``awaited``, or reads events in ``read_ahead``.
+    ``awaited``: the unanswered requests. While there are any, only the socket's owner reads the
+    monitor's events.
+    ``lock``: a thread holds it while it adds to ``awaited``, or reads events in ``read_ahead``.
     """
 
     def __init__(self, socket: zmq.Socket[bytes], endpoint: str, far: TcpServer) -> None:
@@ -145,10 +143,8 @@ class TcpLink:
 
     def drain(self) -> None:
         """Read the monitor's events.
-
-        Raises:
-            SandboxUnavailableError: The server rejects this client, or speaks another protocol.
-            WorkerDiedError: The server accepted this client before, and rejects it now.
+        Raises ``SandboxUnavailableError``: the server rejects this client, or speaks another
+        protocol; ``WorkerDiedError``: the server accepted this client before, and rejects it now.
         """
         if self._refusal is not None:
             refusal, self._refusal = self._refusal, None
@@ -208,10 +204,8 @@ class TcpLink:
 
     def check(self, number: int) -> None:
         """Raise if a reply can no longer come to a message that connection ``number`` carried.
-
-        Raises:
-            WorkerDiedError: The connection was lost.
-            SandboxUnavailableError: No connection has ever succeeded.
+        Raises ``WorkerDiedError``: the connection was lost; ``SandboxUnavailableError``: no
+        connection has ever succeeded.
         """
         self.drain()
         if number <= self._lost:

@@ -118,10 +118,8 @@ class GitBlob:
 
 class GitFiles:
     """The content of a commit, while it is on this machine.
-
-    Attributes:
-        blobs: Its files, and its links, whose content is their target.
-        submodules: The paths of submodules, which are not fetched.
+    ``blobs``: its files, and its links, whose content is their target.
+    ``submodules``: the paths of submodules, which are not fetched.
     """
 
     def __init__(self, blobs: list[GitBlob], submodules: list[str], content: IO[bytes]) -> None:

@@ -39,7 +39,6 @@ class WorkerQueue:
         sliced: Whether there are other workers, whose infos have to be joined with this one's.
 
     Attributes:
-        part, rows: As given.
         count: The number of its sub-environments.
         failure: The error of sending a step, which ``take`` raises.
         taking: Whether an answer is being taken; stays True after an interrupt.

@@ -477,7 +477,6 @@ class SlotRing:
 
     Attributes:
         fd: The slab's descriptor, for the runners.
-        count, slot_bytes: As given.
         chosen: The slot of the last batch.
     """
 
@@ -531,13 +530,8 @@ class SlotRing:
 
 class ObservationSlab(SlotRing):
     """The slab that all shards write their rows into: observations, rewards and flags.
-
-    Args:
-        space: The single observation space.
-        layout: The layout of the slab.
-
-    Attributes:
-        layout: As given.
+    ``space``: the single observation space.
+    ``layout``: the layout of the slab.
     """
 
     def __init__(self, space: gym.Space[Any], layout: slabs.ObservationLayout) -> None:

@@ -54,7 +54,6 @@ class SharedMemoryLane(SlabLane):
 
     Attributes:
         shards: The slabs of each shard.
-        slots: As given.
     """
 
     name = "shared memory"
@@ -317,10 +316,8 @@ class SharedMemoryLane(SlabLane):
 
     def _wait_for_all(self, deadline: Deadline) -> dict[int, WorkerDiedError]:
         """Wait until every shard has answered; returns the runners of a kept jail that died before.
-
-        Raises:
-            WorkerTimeoutError: The deadline came first.
-            WorkerDiedError: The jail has ended.
+        Raises ``WorkerTimeoutError``: the deadline came first; ``WorkerDiedError``: the jail has
+        ended.
         """
         # The order matters:
         #

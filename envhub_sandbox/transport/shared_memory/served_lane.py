@@ -42,10 +42,8 @@ _BYTE, _FLAG, _REWARD = map(np.dtype, (np.uint8, np.bool_, np.float64))
 
 class ServedLane(ColumnSteps):
     """Steps in columns (``ColumnSteps``) through the server's slabs.
-
-    Args:
-        relay: The lane over the server, to the same runners.
-        shards: The slabs of each shard.
+    ``relay``: the lane over the server, to the same runners.
+    ``shards``: the slabs of each shard.
     """
 
     shards: list[ServedShard]
