@@ -17,7 +17,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.errors import EnvHubError, LoadError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.sandboxes.sandbox import retry_while_busy
 from envhub_sandbox.session.builder import JailSource, SharedJail
@@ -36,6 +36,7 @@ from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker import protocol
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.encoder import encode
+from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest, decode_manifest
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.stream import StreamReader, pack_packet
@@ -230,6 +231,7 @@ class EnvFactory:
             shared = dict(zip(self._launchers, jails, strict=True))
             if loaded is not None:
                 shared[self._launcher].provide(loaded)
+        self._bound_parts(manifest)
         makers = [partial(self._session, manifest, env, shared) for env in manifest.envs]
         sessions = [make() for make in makers]
         if loaded is not None and shared is None:
@@ -253,6 +255,17 @@ class EnvFactory:
             partial(_close_all, {} if shared is None else shared),
             repository.recipe,
         )
+
+    def _bound_parts(self, manifest: Manifest) -> None:
+        """Refuse a manifest whose sub-environments would be absurdly many workers of a fleet."""
+        if self._num_workers is not None or len(self._launchers) == 1:
+            return
+        counts = [env.num_envs for env in manifest.envs if env.shardable and not env.sync]
+        if sum(counts) > MAX_NUM_ENVS:
+            raise LoadError(
+                f"{self._repository.label}: its {sum(counts)} sub-environments may each need a "
+                f"worker, and there are at most {MAX_NUM_ENVS}: give num_workers"
+            )
 
     def _session(
         self, manifest: Manifest, env: EnvManifest, shared: SharedJails | None

@@ -15,6 +15,7 @@ from envhub_sandbox import errors, make_env
 from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
+from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from tests.attacks.client.lies import refuses, relayed
@@ -117,6 +118,23 @@ def test_rows_that_are_not_its_own_are_refused(
         assert np.array_equal(observations[HONEST], TRUE["observation"])
         assert rewards[HONEST].tolist() == [7.0] * NUM_ENVS
         assert sum(isinstance(one, m.OpenJail) for one in honest.asked) == opened
+
+
+@pytest.mark.parametrize("sync", [True, False], ids=["the control", "absurdly many"])
+def test_no_more_workers_than_sub_environments_of_one_task(
+    liar: LyingServer, honest: LyingServer, folder: str, sync: bool
+) -> None:
+    """A session for each worker takes 16 KB before it starts; tasks may be thousands."""
+    facts: dict[str, Any] = {"sync": sync, "independent": False}
+    tasks = [env_manifest(task=n, num_envs=MAX_NUM_ENVS // 2 + 1, **facts) for n in range(2)]
+    value = {**encode_manifest(Manifest(envs=(), lazy=True)), "envs": tuple(map(encode_env, tasks))}
+    liar.lies[m.Load] = relayed(m.LoadDone(value))
+    places = [LyingSandbox(liar), LyingSandbox(honest)]
+    if sync:
+        make_env(folder, n_envs=ALL, sandbox=places).close()
+    else:
+        error = refuses(lambda: make_env(folder, n_envs=ALL, sandbox=places))
+        assert "give num_workers" in str(error)
 
 
 def test_values_for_others_are_refused(liar: LyingServer, honest: LyingServer, folder: str) -> None:

@@ -26,7 +26,8 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.vector.actions import UniterableError
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.manifest.manifest import encode_env
+from envhub_worker.protocol.limits import MAX_NUM_ENVS
+from envhub_worker.protocol.manifest.manifest import decode_manifest, encode_env
 from envhub_worker.protocol.spaces.spaces import encode_space
 from tests.attacks.client.lies import (
     ACTIONS,
@@ -189,6 +190,16 @@ def wide(number: int) -> dict[str, Any]:
     return box(shape=(WIDE,), low=np.array(-number, np.float32))
 
 
+def many() -> dict[str, Any]:
+    """A task whose sub-environments take 16 megabytes in the client before one has started."""
+    return changed(num_envs=MAX_NUM_ENVS, sync=False, independent=False)
+
+
+def test_a_task_of_many_sub_environments_is_accepted() -> None:
+    """The control: one of those that are too many together."""
+    assert decode_manifest(many(), max_elements=ELEMENTS).envs[0].num_envs == MAX_NUM_ENVS
+
+
 # some: test_manifest and test_spaces have all that a description may be
 MANIFESTS: dict[str, Callable[[], dict[str, Any]]] = {
     "absurdly many sub-environments": lambda: changed(num_envs=2**40),
@@ -200,6 +211,10 @@ MANIFESTS: dict[str, Callable[[], dict[str, Any]]] = {
     "a hundred Boxes that would each pass": lambda: {
         **manifest(),
         "envs": tuple({**observed(wide(n))["envs"][0], "task": n} for n in range(100)),
+    },
+    "a hundred tasks of sub-environments that would each pass": lambda: {
+        **manifest(),
+        "envs": tuple({**many()["envs"][0], "task": n} for n in range(100)),
     },
     "a Box of Boxes that would each pass": lambda: changed(
         observation_space={"kind": "tuple", "spaces": [wide(n) for n in range(100)]}

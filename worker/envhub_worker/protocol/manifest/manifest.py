@@ -33,6 +33,8 @@ from envhub_worker.protocol.spaces.spaces import encode_space
 
 MAX_ENVS = 4096
 """Vector environments in one manifest: a benchmark suite has a few hundred tasks."""
+SUB_ENV_BYTES = 256
+"""What a sub-environment may cost the client before it starts: a slice, and a function's place."""
 AUTORESET_MODES = ("NextStep", "SameStep", "Disabled")
 
 TaskId = int | str
@@ -138,7 +140,7 @@ def decode_manifest(
 
     Args:
         value: The decoded value.
-        max_elements: Budget of all spaces of all environments together.
+        max_elements: Budget of all spaces and sub-environments of all environments together.
         check: Called before each space; may raise to end the reading, for example at a deadline.
         generator: Checks a state and makes a seeded space's generator from it.
 
@@ -175,6 +177,7 @@ def _decode_env(value: object, reader: SpaceReader) -> EnvManifest:
     num_envs = _typed(fields, "num_envs", int)
     if not 1 <= num_envs <= MAX_NUM_ENVS:
         raise RemoteProtocolError(f"num_envs is {num_envs}, outside 1..{MAX_NUM_ENVS}")
+    reader.spend(num_envs * SUB_ENV_BYTES)
     spaces = {name: reader.space(fields[name]) for name in _SPACES}
     mode, task = fields["autoreset_mode"], fields["task"]
     if mode is not None and (type(mode) is not str or mode not in AUTORESET_MODES):

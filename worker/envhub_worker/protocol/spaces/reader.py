@@ -157,9 +157,9 @@ class SpaceReader:
         self._left -= size
         if self._left < 0:
             raise RemoteProtocolError(
-                f"The spaces cost more than {self._max_elements} elements of a Box. If this is "
-                'intended, raise the limit: limits={"elements": ...}, or message_bytes for spaces '
-                "in an answer"
+                f"The spaces and sub-environments cost more than {self._max_elements} elements of "
+                'a Box. If this is intended, raise the limit: limits={"elements": ...}, or '
+                "message_bytes for spaces in an answer"
             )
 
     def shape(self, value: object, element_bytes: int) -> tuple[int, ...]:
