@@ -368,28 +368,22 @@ class Requests(RequestOrder):
         """
         try:
             with self._incoming():
-                replies = self._collect(deadline_of(timeout), kind, lane)
+                if self.lifecycle.state is not State.PENDING:
+                    raise self._nothing_pending()
+                try:
+                    replies = self._finish((lane or self._lane()).replies, deadline_of(timeout))
+                except RunnersDiedError as deaths:
+                    if self._recovery is None:
+                        raise self._failures.dead(deaths.first) from None
+                    replies = self._recovery.survive_request(deaths)
+                answers = all_replies(replies, kind)
+                if self._recovery is not None:
+                    self._recovery.answered()
         except BaseException as error:
             self.explain(error)
             raise
         self.note_answered()
         self.show_warnings()
-        return replies
-
-    def _collect(
-        self, deadline: Deadline, kind: type[m.M] | tuple[type[m.M], ...], lane: Lane | None
-    ) -> list[m.M]:
-        if self.lifecycle.state is not State.PENDING:
-            raise self._nothing_pending()
-        try:
-            replies = self._finish((lane or self._lane()).replies, deadline)
-        except RunnersDiedError as deaths:
-            if self._recovery is None:
-                raise self._failures.dead(deaths.first) from None
-            replies = self._recovery.survive_request(deaths)
-        answers = all_replies(replies, kind)
-        if self._recovery is not None:
-            self._recovery.answered()
         return answers
 
     def one_each(
