@@ -270,7 +270,11 @@ def publish(
                 with contextlib.suppress(OSError):  # not every file system has locks
                     locks.lock(handle, wait=True)
                 _move_remains(slot)
-                _rename(building, slot.home)
+                try:
+                    os.rename(building, slot.home)
+                except OSError as error:
+                    if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+                        raise  # otherwise another process was faster
     except OSError as error:
         raise _unwritable(slot, error) from error
 
@@ -403,14 +407,6 @@ def _write_record(
     programs = [file.path for file in files if file.executable]
     record = {**document, "files": rows, "programs": programs}
     write_whole_file(home / "record.json", json.dumps(record).encode())
-
-
-def _rename(building: Path, home: Path) -> None:
-    try:
-        os.rename(building, home)
-    except OSError as error:
-        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):  # another process was faster
-            raise
 
 
 def commits(folder: Path) -> list[StoredCommit]:
