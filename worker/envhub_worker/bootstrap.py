@@ -28,13 +28,8 @@ _PROGRAMS = {
     "bytecode": "envhub_worker.extras.bytecode",
 }
 
-_NEEDED = {
-    "cloudpickle": "cloudpickle",
-    "gymnasium": "gymnasium",
-    "msgpack": "msgpack",
-    "numpy": "numpy",
-    "zmq": "pyzmq",
-}
+_NEEDED = {name: name for name in ("cloudpickle", "gymnasium", "msgpack", "numpy")}
+_NEEDED |= {"zmq": "pyzmq"}
 """What this package imports, and what that is called where it is installed from."""
 
 

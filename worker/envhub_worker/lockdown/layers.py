@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from typing import Any
-
 from envhub_worker.protocol.records import dataclass
 
 
@@ -15,10 +12,6 @@ class Layer:
     layer: str
     enforced: bool
     detail: str
-
-    def to_wire(self) -> dict[str, Any]:
-        """Plain data: ``{"layer", "enforced", "detail"}``."""
-        return asdict(self)
 
 
 class LayerUnavailableError(Exception):

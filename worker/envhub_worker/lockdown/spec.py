@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import fields
 from typing import Any
 
 from envhub_worker.protocol.confinement import DISPLAYS, NETWORKS, PROFILES, Confinement, Limits
@@ -37,13 +37,9 @@ class JailSpec:
     confinement: Confinement
     hub_copies: tuple[HubCopy, ...] = ()
 
-    def to_wire(self) -> dict[str, Any]:
-        """Returns plain data for a channel between our own processes."""
-        return asdict(self)
-
     @classmethod
     def from_wire(cls, data: dict[str, Any]) -> JailSpec:
-        """The inverse of ``to_wire``."""
+        """Rebuilds a specification from its ``dataclasses.asdict`` form after JSON."""
         copies = read_hub_copies(data["hub_copies"])
         confinement = confinement_from_wire(data["confinement"])
         return cls(**{**data, "confinement": confinement, "hub_copies": copies})

@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +109,7 @@ class Jail:
         """Send init its specification, on the channel that only the two of us hold."""
         self._group = group
         message = {
-            "spec": self.spec.to_wire(),
+            "spec": asdict(self.spec),
             "scratch": str(self._folder),
             "cgroup": group and group.kind,
         }

@@ -29,7 +29,7 @@ import signal
 import socket
 import sys
 import traceback
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, NoReturn
 
 from envhub_worker.find_extra import find_extra
@@ -150,7 +150,7 @@ class Init:
         if confinement.record_denials and denials is not None:
             self._recorder = denials.Recorder(self._jail, self._report_denied)
         self._watchdog = Watchdog(self._jail, events)
-        report = [layer.to_wire() for layer in (*layers, jail.working_view(view))]
+        report = [asdict(layer) for layer in (*layers, jail.working_view(view))]
         self._channel.send({"event": "ready", "report": report})
 
     def _stop(self, *_: object) -> None:

@@ -22,6 +22,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import NoReturn
 
 from envhub_worker.find_extra import find_extra
@@ -77,7 +78,7 @@ def _run(jail: JailContext, fds: list[int], init: Channel, runners: int) -> int:
     # it and what that starts later. Then the report: the server takes the runner for confined from
     # here on. The channel to init is closed before anything is read that a stranger wrote.
     blas.restore_threads(jail.common.set_blas_threads, runners)
-    init.send({"report": [_SELF_TEST.to_wire()]})
+    init.send({"report": [asdict(_SELF_TEST)]})
     init.close()
     make_hub_cache(jail.spec)
     if lerobot_stub is not None:
