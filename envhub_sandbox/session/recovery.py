@@ -53,6 +53,7 @@ class Recovery:
         self._counters = lease.counters
         self._recorder = recorder
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
+        self._in_rollout = False  # whether LeRobot has announced one
         self._settings: dict[Any, list[list[bytes]]] = {}  # by target: each shard's frames
         self._setting: tuple[Any, list[list[bytes]]] | None = None  # set by the pending request
         self._asked: Sequence[m.Message] = ()  # of the last request, for new runners to repeat
@@ -60,8 +61,9 @@ class Recovery:
     # --- requests --------------------------------------------------------------------------------
 
     def started(self) -> None:
-        """Forget the attributes that were set, since the jail is new."""
+        """Forget the attributes that were set, and a rollout, since the jail is new."""
         self._settings.clear()
+        self._in_rollout = False
 
     def sent(self, request: Request) -> None:
         """Remember the seeds and attributes of a request that was sent."""
@@ -70,6 +72,8 @@ class Recovery:
         for message, (start, _) in zip(messages, self._bounds, strict=True):
             if isinstance(message, m.Reset):
                 self._seeds.remember(message, start)
+                options = message.options if isinstance(message.options, dict) else {}
+                self._in_rollout = self._in_rollout or bool(options.get(m.NEW_ROLLOUT))
         target = _target_of(messages)
         if target is not None:
             self._setting = target, request.kept()
@@ -210,7 +214,7 @@ class Recovery:
         """The requests to a dead shard's new runner, in order."""
         seeds = self._seeds.derived(self._bounds[index], self._counters.restarts)
         if operation == "step":
-            return [m.Revive(lane.number, seeds)]
+            return [m.Revive(lane.number, seeds, self._in_rollout)]
         reset = self._asked[index]
         assert isinstance(reset, m.Reset)
         return resets(reset, seeds)

@@ -16,6 +16,7 @@ from tests.support.samples import Frozen
 
 NEW = {"lerobot_new_rollout": True}
 ENVS = """
+import os
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box, Dict
@@ -43,6 +44,8 @@ class Counted(gym.Env):
         return self.seen(), {"is_success": False, "fresh": self.count["reset"]}
 
     def step(self, action):
+        if action[0] == 2:
+            os._exit(3)
         self.count["step"] += 1
         self.steps += 1
         self.at = self.at + action
@@ -128,6 +131,27 @@ def test_what_has_ended_is_not_asked_again(counted: Path, way: str) -> None:
         for frame, last in zip(env.call("render"), frames[-1], strict=True):
             assert not np.array_equal(frame, last)
         assert env.get_attr("given")[0] == [NEW, NEW]
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_an_episode_that_a_death_cut_stays_ended(counted: Path, mode: str) -> None:
+    """Also after a restart: no reward of a further episode counts, until the next rollout."""
+    options: dict[str, Any] = {**WAYS["two workers"], "policy": {"restart": "transparent"}}
+    with make_env(counted, n_envs=2, env_kwargs={"mode": mode}, **options) as suites:
+        env = suites.env
+        env.reset(seed=0, options=NEW)
+        live, dies = np.zeros((2, 2), np.float32), np.float32([[0, 0], [2, 0]])
+        env.step(live)
+        cut = env.step(dies)
+        assert cut[4]["worker_restarted"].tolist() == [False, True]
+        for step in range(3):
+            observation, rewards, _, truncated, _ = env.step(live)
+            # NEXT_STEP has a step for the reset, which is absorbed
+            assert (rewards[1], truncated[1]) == (0, mode == "SameStep" or step % 2 == 1)
+            assert np.array_equal(observation["agent_pos"][1], cut[0]["agent_pos"][1])
+        assert env.get_attr("count")[1] == {"reset": 1, "step": 0, "render": 0}
+        env.reset(seed=1, options=NEW)
+        assert env.step(live)[1].tolist() == [1, 1]
 
 
 def test_one_of_several_is_frozen_as_well(counted: Path) -> None:

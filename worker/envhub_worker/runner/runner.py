@@ -253,7 +253,7 @@ class Runner:
         """Reset sub-environments that replace dead ones: see ``m.Revive``."""
         env = self._envs[request.env]
         if isinstance(env, SubEnvs):
-            return _step_done(env, env.run_revive(request.seeds))
+            return _step_done(env, env.run_revive(request.seeds, request.rollout))
         observation, info = compat.reset_result(env, env.reset(seed=request.seeds))
         no, yes = np.zeros(env.num_envs, np.bool_), np.ones(env.num_envs, np.bool_)
         return m.StepDone(observation, np.zeros(env.num_envs), no, yes, info)

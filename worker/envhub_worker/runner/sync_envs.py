@@ -23,6 +23,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
+from envhub_worker.protocol.messages.runner import NEW_ROLLOUT
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
@@ -36,7 +37,6 @@ _NUMBERS = (float, int, np.number, np.bool_)
 
 Pairs = list[tuple[int, dict[Any, Any]]]
 """Infos with the index of their sub-environment, in the order in which they came."""
-NEW_ROLLOUT = "lerobot_new_rollout"
 DRIVES = frozenset({"reset", "step", "render"})
 """What a ``FreezingEnv`` has of an environment."""
 
@@ -47,10 +47,13 @@ def announces_rollout(options: Any) -> bool:
 
 
 class FreezingEnv:
-    """Wraps a sub-environment's ``reset``, ``step`` and ``render``: it freezes at the end."""
+    """Wraps a sub-environment's ``reset``, ``step`` and ``render``: it freezes at the end.
+    ``cut``: whether its episode died, so that it is frozen after its first reset.
+    """
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env: Any, *, cut: bool = False) -> None:
         self._env = env
+        self._cut = cut
         self._last: Any = None  # the transition that ended the episode; None before it
         self._frame: Any = None  # the picture after it
 
@@ -59,7 +62,11 @@ class FreezingEnv:
         if self._last is not None and not announces_rollout(options):
             return self._last[0], self._last[4]
         self._last = self._frame = None
-        return self._env.reset(seed=seed, options=options)
+        observation, info = self._env.reset(seed=seed, options=options)
+        if self._cut:
+            self._cut = False
+            self._last = (observation, 0.0, False, True, info)
+        return observation, info
 
     def step(self, action: Any) -> Any:
         """Like ``Env.step``; once frozen, returns the last transition instead."""
@@ -244,13 +251,15 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             self.shared.look()
         return infos
 
-    def run_revive(self, seeds: Any) -> Pairs:
+    def run_revive(self, seeds: Any, rollout: bool = False) -> Pairs:
         """Reset all, in place of dead sub-environments whose episodes end; returns the infos.
 
         The episodes are truncated. The last observations died with the sub-environments: the new
-        observations replace those, too.
+        observations replace those, too. In a rollout they freeze there.
         """
-        infos = self.run_reset(seeds, None, None)
+        if rollout:
+            self.driven = [FreezingEnv(one, cut=True) for one in self.envs]
+        infos = self.run_reset(seeds, {NEW_ROLLOUT: True} if rollout else None, None)
         self.batch.rewards[...] = 0.0
         self.batch.truncations[...] = True
         self._flagged = list(range(self.num_envs))

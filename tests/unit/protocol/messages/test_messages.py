@@ -75,7 +75,7 @@ SAMPLES: list[m.Message] = [
     m.GetRandom(1), m.SetRandom(1, (None, {"bit_generator": "PCG64"}), True),
     m.GetOne(1, 0, None, "task"), m.CallOne(1, None, 0, "add", (1, "x"), {"flag": True}),
     m.Close(1), m.Value((None, "a", 1.5)), m.Attach(1, 2, 8, 5), m.FetchInfos(1),
-    m.ForgetEnds(1), m.TakeApart(1, True), m.Revive(1, [5, None]), m.FollowOutput(3, 4096),
+    m.ForgetEnds(1), m.TakeApart(1, True), m.Revive(1, [5, None], True), m.FollowOutput(3, 4096),
     m.OutputBytes(4096, b"caf\xc3\xa9\x1b"),
     m.RaisedException("KeyError", "mypkg.Oops", "gone", "Traceback ...", "step"),
     m.Warnings((("UserWarning", "slow"), ("mypkg.Own", "caf\u00e9"))),

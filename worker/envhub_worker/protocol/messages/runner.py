@@ -14,6 +14,10 @@ stands for the whole, as of an enum's member. ``computed`` has the values of its
 """
 
 
+NEW_ROLLOUT = "lerobot_new_rollout"
+"""The option of a reset by which LeRobot announces a rollout."""
+
+
 class Load(Message, kind=64, asks="make_env", handed=("cfg", "env_kwargs")):
     """Import the entry file and call its ``make_env``. Reply: ``LoadDone`` or ``RaisedException``.
 
@@ -198,11 +202,13 @@ class Revive(Message, kind=84):
     """Reset all sub-environments, which replace others that died in the middle of an episode.
 
     Reply: ``StepDone`` with the new observations, zero rewards, and every episode truncated. The
-    autoreset mode decides what the next step does with the truncated episodes.
+    autoreset mode decides what the next step does with the truncated episodes; in a ``rollout``
+    that was announced, they stay ended until the next one.
     """
 
     env: int
     seeds: object
+    rollout: bool = False
 
 
 class ForgetEnds(Message, kind=85):
