@@ -368,8 +368,11 @@ def _refuse_shared_store(store: Path) -> None:
     root = cache_root()
     try:
         why = folders.why_distrusted(store, root)
-    except PermissionError as error:
-        raise SnapshotError(f"the snapshot store {root} cannot be read: {error}") from error
+    except (NotADirectoryError, PermissionError) as error:
+        raise SnapshotError(
+            f"the snapshot store {root} cannot be read: {error}. Fix it, or set ENVHUB_CACHE to "
+            "another folder"
+        ) from error
     if why:
         raise SnapshotError(
             f"the snapshot store {root} is not trusted, because other users can change it: {why}; "

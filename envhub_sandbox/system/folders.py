@@ -123,6 +123,8 @@ def _steps(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
 
 
 def _fault(path: str, status: os.stat_result, strict: bool) -> str:
+    if stat.S_ISCHR(status.st_mode):
+        return ""  # such as /dev/null, a home in name only, whose mode is everybody's concern
     kind = "link" if stat.S_ISLNK(status.st_mode) else "folder"
     kind = "file" if stat.S_ISREG(status.st_mode) else kind
     quoted = shlex.quote(path)

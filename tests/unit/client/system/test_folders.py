@@ -173,6 +173,9 @@ def test_links_are_followed_step_by_step(
     (tmp_path / "open").chmod(0o777)
     with pytest.raises(SnapshotError, match="open can be written by everybody"):
         store.load(behind)
+    monkeypatch.setenv("ENVHUB_CACHE", "/dev/null/cache")  # not "chmod go-w /dev/null"
+    with pytest.raises(SnapshotError, match="Not a directory"):
+        store.load(store.Slot(store.folder_of("local"), COMMIT, "x"))
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
     with pytest.raises(OSError, match="Too many levels"):  # a circle is an error, as for the kernel
