@@ -42,7 +42,7 @@ def test_that_of_killed_servers_is_none(tmp_path: Path, capsys: pytest.CaptureFi
     assert status.status_is_healthy(tmp_path) is None
     asked = argparse.Namespace(state_dir=tmp_path, endpoint=None, json=False)
     assert status.run(asked) == 1
-    assert "is running here" in capsys.readouterr().err
+    assert f"is running here with the state folder {tmp_path};" in capsys.readouterr().err
     ours = Note(tmp_path, B)
     assert state_folder.read_note(tmp_path) == B
     ours.remove()

@@ -63,7 +63,9 @@ def address_here(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair]:
     """Returns the address of the server on a state folder here. Raises ``UnreachableError``."""
     noted = _noted(chosen)
     if noted is None:
-        raise UnreachableError("no 'envhub-worker listen' of this user is running here")
+        folder = state_dir(chosen, create=False)
+        at = f" with the state folder {folder}; --state-dir names another" if folder else ""
+        raise UnreachableError(f"no 'envhub-worker listen' of this user is running here{at}")
     return noted
 
 
