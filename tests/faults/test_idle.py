@@ -88,18 +88,8 @@ def works(env: Any, action: Any, enough: Callable[[], bool]) -> bool:
 
 @policies
 def test_idle_processes_end_and_a_reset_starts_others(lane: str, restart: str) -> None:
-    """It is no death: no policy and no budget is asked, and the same seeds give the same."""
-    with made(lane, restart) as env:
-        assert ended(played(env))
-        observation, info = brought_back(env)
-        assert observation.tolist() == oracle().reset(seed=SEED)[0].tolist()
-        assert "worker_restarted" not in info
-        assert played(env)
-        assert env.sandbox.stats()["deaths"] == env.sandbox.stats()["restarts"] == 0
-
-
-@policies
-def test_a_step_after_that_says_that_a_reset_is_needed(lane: str, restart: str) -> None:
+    """It is no death: no policy and no budget is asked, and the same seeds give the same. A step
+    before that says that a reset is needed."""
     with made(lane, restart) as env:
         assert ended(played(env))
         for ask in (lambda: env.step(ALL_LIVE), lambda: env.call("hello")):
@@ -107,8 +97,13 @@ def test_a_step_after_that_says_that_a_reset_is_needed(lane: str, restart: str) 
                 ask()
             assert caught.value.reason == "idle"
             assert state(env) is State.EXPIRED
-        brought_back(env)
+        observation, info = brought_back(env)
+        assert observation.tolist() == oracle().reset(seed=SEED)[0].tolist()
+        assert "worker_restarted" not in info
         assert state(env) is State.READY
+        assert ended(played(env))
+        brought_back(env)
+        assert env.sandbox.stats()["deaths"] == env.sandbox.stats()["restarts"] == 0
 
 
 @lanes

@@ -187,16 +187,6 @@ def test_keys_of_no_text_harm_none(liar: LyingServer, folder: str, other: Any, k
             other.step(ACTIONS)
 
 
-RUNNERS = {"a list": ([],), "a text": ("1",), "none": (None,), "a float": (1.0,)}
-
-
-@pytest.mark.parametrize("what", list(RUNNERS))
-def test_runners_without_numbers_are_refused(liar: LyingServer, folder: str, what: str) -> None:
-    liar.lies[m.OpenJail] = lambda asked: [asked.answer(m.JailOpened(1, RUNNERS[what], ()))]
-    with pytest.raises(RemoteProtocolError):
-        opened(liar, folder)
-
-
 GRAPHS = spaces.Dict({"g": spaces.Graph(spaces.Box(0, 1, (2,)), None), "x": spaces.Discrete(2)})
 ODD: dict[str, Any] = {
     "nothing": None,

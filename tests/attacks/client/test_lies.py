@@ -451,11 +451,14 @@ def test_wrong_sums_of_parts_refused(
         m.Refusal("os.system", "\x1b[2J", "", ""),
         m.JailOpened(1, (), ()),
         m.JailOpened(1, ("1",), ()),
+        m.JailOpened(1, ([],), ()),
+        m.JailOpened(1, (1.0,), ()),
         m.Death(-1, "exit", None, "\x1b[2J", "\x1b[2J", "\x1b[2J", "\x1b[2J"),
         m.Value(None),
     ],
     ids=[
-        *("version", "painted-refusal", "unknown-refusal", "no-runners", "no-numbers"),
+        *("version", "painted-refusal", "unknown-refusal", "no-runners"),
+        *("a-text", "a-list", "a-float"),
         *("painted-death", "other"),
     ],
 )

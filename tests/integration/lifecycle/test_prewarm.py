@@ -260,7 +260,8 @@ def test_what_dies_unused_is_started_again(tasks: Callable[..., Tasks]) -> None:
 
 
 def test_closed_in_the_midst_it_leaves_nothing(repository: Path) -> None:
-    """Whenever that comes: no process, and no bundle of a crash that was none."""
+    """Whenever that comes: no process, and no bundle of a crash that was none. So does a suite that
+    nobody holds."""
     stop_idle()
     before, bundles = descendants(), set(_bundles())
     for pause_s in (0.0, 0.05, 0.2):
@@ -272,6 +273,13 @@ def test_closed_in_the_midst_it_leaves_nothing(repository: Path) -> None:
         assert states(envs) == ["CLOSED"] * 5
         with pytest.raises(ClosedEnvironmentError):
             envs[0].prewarm()
+    assert eventually(lambda: descendants() <= before)
+    suites = make_env(repository, policy={"prewarm": 1}, timeouts={"server_idle_s": 0})
+    envs = _of(suites)
+    envs[0].reset()
+    assert eventually(lambda: ahead(envs) == [1])
+    envs.clear()
+    del suites
     assert eventually(lambda: descendants() <= before)
     assert set(_bundles()) == bundles
 
@@ -286,18 +294,6 @@ def test_the_last_close_waits_for_all(tasks: Callable[..., Tasks]) -> None:
     for env in envs:
         env.close()
     assert descendants() - elsewhere <= server - elsewhere
-
-
-def test_a_suite_that_nobody_holds_gives_up_what_it_started_ahead(repository: Path) -> None:
-    stop_idle()
-    before = descendants()
-    suites = make_env(repository, policy={"prewarm": 1}, timeouts={"server_idle_s": 0})
-    envs = _of(suites)
-    envs[0].reset()
-    assert eventually(lambda: ahead(envs) == [1])
-    envs.clear()
-    del suites
-    assert eventually(lambda: descendants() <= before)
 
 
 def played(env: Any) -> list[Any]:

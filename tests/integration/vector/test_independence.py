@@ -16,6 +16,7 @@ from envhub_sandbox.errors import RemoteEnvWarning
 from envhub_worker.runner import independence
 from tests.support import inside
 from tests.support.compare import assert_same
+from tests.support.repositories import write_repository
 
 N_ENVS = 3
 _LONG_S = 600.0
@@ -111,13 +112,9 @@ def make_env(n_envs=1, use_async_envs=False, kind="plain", mode="NEXT_STEP"):
 
 
 @pytest.fixture
-def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder; nothing is remembered of it."""
-    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
-    folder = tmp_path / "repository"
-    folder.mkdir()
-    (folder / "env.py").write_text(REPOSITORY)
-    return folder
+def repository(tmp_path: Path) -> Path:
+    """The folder; each is another one, so nothing is remembered of it."""
+    return write_repository(tmp_path / "repository", f"# {tmp_path}\n{REPOSITORY}")
 
 
 def processes(repository: Path, **kwargs: Any) -> int:
