@@ -18,6 +18,7 @@ from gymnasium.error import ClosedEnvironmentError
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError, WorkerError
 from envhub_sandbox.sandboxes.pool import stop_idle
+from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.system.folders import cache_root
 from tests.support import inside
 from tests.support.processes import descendants, eventually
@@ -57,6 +58,20 @@ def make_env(n_envs=1, use_async_envs=False, tasks=5, fails=-1, suites=1):
 Tasks = list[Any]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _server() -> Iterator[None]:
+    """One for all of these, beside which is seen what they leave; in the end it goes, too."""
+    stop_idle()
+    before = descendants()
+    use = PROCESS.acquire(cache_root() / "snapshots")
+    with make_env(sample("counter")):
+        pass  # its zygote is up
+    yield
+    use.release()
+    # what is interrupted in its start gives the server back a moment later, and that lingers
+    assert eventually(lambda: stop_idle() is None and descendants() <= before)
+
+
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
     return write_repository(tmp_path / "repository", STILL + SUITE)
@@ -65,7 +80,6 @@ def repository(tmp_path: Path) -> Path:
 @pytest.fixture
 def tasks(repository: Path) -> Iterator[Callable[..., Tasks]]:
     """Makes the environments of a suite; nothing of them is left at the end."""
-    stop_idle()
     before = descendants()
     made = []
 
@@ -80,8 +94,7 @@ def tasks(repository: Path) -> Iterator[Callable[..., Tasks]]:
     yield make
     for suites in made:
         suites.close()
-    # what is interrupted in its start gives the server back a moment later, and that lingers
-    assert eventually(lambda: stop_idle() is None and descendants() <= before)
+    assert eventually(lambda: descendants() <= before)
 
 
 def states(tasks: Tasks) -> list[str]:
@@ -192,7 +205,6 @@ def gated(tmp_path: Path) -> tuple[Path, Path, dict[str, Any]]:
     with make_env(repository, policy=policy):
         pass
     opened.unlink()
-    stop_idle()
     return repository, opened, policy
 
 
@@ -207,8 +219,8 @@ def test_while_one_is_waited_for_the_next_is_started(
         envs = _of(suites)
         if plays:
             envs[0].reset()
-            # the server, its zygote's two, and two jails of two: the second one is at the gate
-            assert eventually(lambda: len(descendants() - elsewhere) == 7)
+            # two jails of two: the second one is at the gate
+            assert eventually(lambda: len(descendants() - elsewhere) == 4)
         assert all(_begun_meanwhile(envs, opened))
 
 
@@ -242,11 +254,9 @@ def test_what_fails_is_raised_by_the_tasks_first_request(tasks: Callable[..., Ta
 
 def test_what_dies_unused_is_started_again(tasks: Callable[..., Tasks]) -> None:
     """Although the policy restarts nothing: without prewarming it would not have died."""
-    elsewhere = descendants()  # other tests' Hubs, say
-    envs = tasks(2, policy={"prewarm": 1})
-    # the server that lingers, its zygote's two
-    assert eventually(lambda: len(descendants() - elsewhere) == 3)
     server = descendants()
+    envs = tasks(2, policy={"prewarm": 1})
+    assert eventually(lambda: descendants() <= server)
     envs[0].reset()
     envs[0].close()
     assert eventually(lambda: ahead(envs) == [1])
@@ -262,7 +272,6 @@ def test_what_dies_unused_is_started_again(tasks: Callable[..., Tasks]) -> None:
 def test_closed_in_the_midst_it_leaves_nothing(repository: Path) -> None:
     """Whenever that comes: no process, and no bundle of a crash that was none. So does a suite that
     nobody holds."""
-    stop_idle()
     before, bundles = descendants(), set(_bundles())
     for pause_s in (0.0, 0.05, 0.2):
         suites = make_env(repository, policy={"prewarm": 2}, timeouts={"server_idle_s": 0})
