@@ -153,6 +153,11 @@ class Lease:
             return None
         return self.lane.jail.watched.values(self.lane.number, name)
 
+    def take_seeded(self) -> bool:
+        """Whether a reset has seeded the single spaces since the last call."""
+        lane = self.lane
+        return lane is not None and lane.jail.watched.take_seeded(lane.number)
+
     def note_watched(self, name: str, values: AttributeAnswer) -> bool:
         """Keep the values of a watched attribute; returns whether they can be kept."""
         lane = self.lane
@@ -412,6 +417,10 @@ class AttributeCache:
                 gathered += answer
         reads.steps = self._steps()
         return error or tuple(gathered)
+
+    def take_seeded(self) -> bool:
+        """Whether a reset has seeded the single spaces, in any worker, since the last call."""
+        return any(lease.take_seeded() for lease in self._leases)
 
     def should_watch(self, name: str) -> bool:
         """Count a read that needs a request; returns whether to have the attribute watched."""

@@ -379,6 +379,10 @@ AttributeAnswer = tuple[Any, ...] | RemoteEnvError
 """The attribute's value in each sub-environment, or the error that reading it raises."""
 
 
+_MOST_SEEDED = 4096
+"""Environments of one jail, of which a worker may name any."""
+
+
 class WatchedAttributes:
     """The values of watched attributes, by the environment's number and the attribute's name.
 
@@ -390,6 +394,13 @@ class WatchedAttributes:
 
     def __init__(self) -> None:
         self._values: dict[Attribute, AttributeAnswer] = {}
+        self._seeded: set[int] = set()  # environments whose spaces a reset has seeded
+
+    def take_seeded(self, number: int) -> bool:
+        """Whether a reset has seeded the spaces of an environment since the last call."""
+        seeded = number in self._seeded
+        self._seeded.discard(number)
+        return seeded
 
     def note(self, number: int, name: str, values: AttributeAnswer) -> bool:
         """Keep values that were read. Returns whether their types allow that."""
@@ -415,4 +426,6 @@ class WatchedAttributes:
         changed, rest = CHANGES.read(frames)
         for attribute in changed:
             self._values.pop(attribute, None)
+            if attribute[1] == m.SPACES and len(self._seeded) < _MOST_SEEDED:
+                self._seeded.add(attribute[0])
         return rest

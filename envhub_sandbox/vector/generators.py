@@ -27,7 +27,7 @@ from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.spaces.spaces import BIT_GENERATORS
 
 _NUMBER = "number"
-_SAID_NEXT = (WorkerError, RemoteEnvError, AlreadyPendingCallError, ClosedEnvironmentError)
+SAID_NEXT = (WorkerError, RemoteEnvError, AlreadyPendingCallError, ClosedEnvironmentError)
 """Errors of reading generators after a request, which must not hide its answer. The next request
 raises them."""
 
@@ -122,7 +122,7 @@ class Generators:
         if self._current or self._asking or self._requests.waiting is not None:
             return
         if any(live.references() != _UNKEPT for live in self._live):
-            with suppress(*_SAID_NEXT):
+            with suppress(*SAID_NEXT):
                 self._fetch()
 
     def _fetch(self) -> None:

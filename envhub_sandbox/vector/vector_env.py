@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 import weakref
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from copy import copy, deepcopy
 from functools import partial
 from threading import get_ident
@@ -26,7 +27,7 @@ from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Own, StepResult
 from envhub_sandbox.transport.values import not_here, seeds
 from envhub_sandbox.vector.actions import action_reader, check_mask, reset_message, seeds_for_all
-from envhub_sandbox.vector.generators import Generators
+from envhub_sandbox.vector.generators import SAID_NEXT, Generators
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.send_recv import SendRecv
 from envhub_sandbox.vector.space_copies import SpaceCopies
@@ -234,7 +235,19 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:
         replies = self._requests.collect(timeout_s, m.ResetDone)
-        return self._requests.finish_reset(replies)
+        done = self._requests.finish_reset(replies)
+        if self._requests.attributes.take_seeded():
+            self._follow_spaces()
+        return done
+
+    def _follow_spaces(self) -> None:
+        """Have the single spaces draw as those that a reset has seeded. Those of an
+        ``AsyncVectorEnv`` belong to no sub-environment, unless it is shown as a single one.
+        """
+        if self._manifest.sync or self._requests.results.single:
+            with suppress(*SAID_NEXT):
+                for name in ("observation_space", "action_space"):
+                    self.envs[0]._get(name)
 
     def step(self, actions: Any) -> StepResult:
         """Step every sub-environment.

@@ -194,6 +194,7 @@ def test_a_space_is_one_object_however_it_is_read(make: Callable[..., Any]) -> N
 
     def drive(env: Any) -> Iterator[Any]:
         env.reset(seed=1)
+        yield draws(env.single_action_space)
         for one in env.envs:
             yield draws(one.unwrapped.action_space)
             one.unwrapped.action_space.seed(3)
@@ -206,6 +207,7 @@ def test_a_space_is_one_object_however_it_is_read(make: Callable[..., Any]) -> N
         env.call("of", "a")[0].seed(7)
         yield list(map(draws, env.call("of", "a")))
         env.reset(seed=8)
+        yield draws(env.single_action_space)
         yield [draws(one.action_space) for one in env.envs], draws(env.single_action_space)
         env.call("grow")
         yield [str(each.action_space) for one in env.envs for each in (one, one.unwrapped)]

@@ -7,16 +7,18 @@ stream.
 
 from __future__ import annotations
 
+import itertools
 import os
 import select
 import socket
 from array import array
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from time import monotonic
 from typing import Any
 
 import cloudpickle  # type: ignore[import-untyped]
+import gymnasium as gym
 import numpy as np
 
 from envhub_worker.lockdown.spec import JailSpec
@@ -25,6 +27,7 @@ from envhub_worker.protocol.codec import unsendable as unsendable  # a reply may
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits, limits_for
 from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
+from envhub_worker.protocol.spaces.spaces import seeded_nodes, seeded_states
 from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner import loader, manifest
@@ -118,6 +121,7 @@ class Runner:
         play_bytes: int = 1 << 30,
     ) -> None:
         self._numbers = SpaceNumbers()
+        self._space_generators: dict[int, list[Any]] = {}  # of the first sub-environments
         self._pack = partial(m.pack, describer=partial(numbered, self._numbers), limits=limits)
         self._pack_infos = partial(m.pack, describer=described, limits=limits, reduces=True)
         self._snapshot = snapshot
@@ -226,11 +230,18 @@ class Runner:
             env.shared = shared
             shared.built(env.envs)
         self._numbers.built(_declared_spaces(env), request.start)
+        if not request.start:
+            self._space_generators[request.env] = _space_generators(env)
         return m.BuildDone(encode_env(manifest.describe_vector(task, env)))
 
     def reset(self, request: m.Reset) -> m.Message:
         """``VectorEnv.reset``."""
         env = self._envs[request.env]
+        reply = self._reset(env, request)
+        self._note_seeded(request.env, env)
+        return reply
+
+    def _reset(self, env: Any, request: m.Reset) -> m.Message:
         if isinstance(env, SubEnvs):
             infos = env.joined(env.run_reset(request.seeds, request.options, request.mask))
             return m.ResetDone(env.batch.observation(), infos)
@@ -240,6 +251,16 @@ class Runner:
             options["reset_mask"] = request.mask
         result = _call_own(env, "reset", seed=request.seeds, options=options)
         return m.ResetDone(*compat.reset_result(env, result))
+
+    def _note_seeded(self, number: int, env: Any) -> None:
+        """Tell the client if a reset has seeded the spaces that it shows as the vector's own."""
+        before = self._space_generators.get(number)
+        now = _space_generators(env)
+        if before is None or list(map(id, before)) == list(map(id, now)):
+            return
+        self._space_generators[number] = now  # kept, so that no other one gets its id
+        if any(map(seeded_states, _single_spaces(env))):
+            self.watches.changed[number, m.SPACES] = None
 
     def step(self, request: m.Step) -> m.Message:
         """``VectorEnv.step``."""
@@ -394,6 +415,7 @@ class Runner:
         # by then.
         env = self._envs.pop(request.env, None)
         self._generators.pop(request.env, None)
+        self._space_generators.pop(request.env, None)
         self.watches.forget(request.env)
         if request.env in self.lanes:
             self.forget_lane(self.lanes[request.env])
@@ -402,12 +424,23 @@ class Runner:
         return m.Value(None)
 
 
-def _declared_spaces(env: Any) -> list[tuple[Any, Any]]:
+def _declared_spaces(env: Any) -> list[Sequence[Any]]:
     """Each sub-environment's spaces, or the single ones of a repository's own vector class."""
     if isinstance(env, SubEnvs):
         return [(one.observation_space, one.action_space) for one in env.envs]
-    own = getattr(env, "single_observation_space", None), getattr(env, "single_action_space", None)
-    return [own]
+    names = "single_observation_space", "single_action_space"
+    return [[getattr(env, name, None) for name in names]]
+
+
+def _single_spaces(env: Any) -> list[Any]:
+    [found, *_] = _declared_spaces(env)
+    return [space for space in found if isinstance(space, gym.Space)]
+
+
+def _space_generators(env: Any) -> list[Any]:
+    """The generators of the single spaces and of their parts; None where there is none yet."""
+    nodes = itertools.chain.from_iterable(map(seeded_nodes, _single_spaces(env)))
+    return [getattr(node, "_np_random", None) for node in nodes]
 
 
 def _call_own(env: Any, method: str, *args: Any, **kwargs: Any) -> Any:

@@ -18,6 +18,10 @@ NEW_ROLLOUT = "lerobot_new_rollout"
 """The option of a reset by which LeRobot announces a rollout."""
 
 
+SPACES = "<spaces>"
+"""In place of an attribute in ``Changes``: a reset has seeded the vector's single spaces."""
+
+
 class Load(Message, kind=64, asks="make_env", handed=("cfg", "env_kwargs")):
     """Import the entry file and call its ``make_env``. Reply: ``LoadDone`` or ``RaisedException``.
 

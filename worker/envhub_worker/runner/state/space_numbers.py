@@ -30,7 +30,7 @@ class SpaceNumbers:
         number, known = self._numbers.get(id(space), (0, None))
         return number if known is not None else self._note(space, next(self._fresh))
 
-    def built(self, pairs: Iterable[tuple[Any, Any]], start: int) -> None:
+    def built(self, pairs: Iterable[Iterable[Any]], start: int) -> None:
         """Number the spaces of new sub-environments, of which ``start`` is the first one's index.
 
         The numbers are the same in each process that builds these, also after a restart. Those of
