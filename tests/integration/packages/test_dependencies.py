@@ -168,7 +168,7 @@ class Finder:
             if os.path.isfile(file): return importlib.util.spec_from_file_location(name, file)
 sys.meta_path.append(Finder)
 """
-WAYS = ["flat", "single", "redirected", "searched", "linked", "source", "for_the_user"]
+WAYS = ["flat", "single", "redirected", "searched", "linked", "strict", "source", "for_the_user"]
 LOCAL = f"import {', '.join(WAYS)}\n" + importing(
     "pathlib",
     sum=f"sum(one.VALUE for one in ({', '.join(WAYS)}))",
@@ -198,7 +198,11 @@ def test_each_way_to_a_module_leads_there_in_a_jail(tmp_path: Path) -> None:
         (site / f"editable{name}.py").write_text(finder)
     (site / "linked").symlink_to(base / "linked" / "linked")
     ours = [*filter(os.path.isabs, sys.path), Path(__file__).parents[3], BOOTSTRAP.parents[1]]
-    lines = [*map(str, ours), str(base / "source"), *(f"import editable{name}" for name in tables)]
+    strict = base / "strict" / "build" / "__editable__.strict-1"
+    (strict / "strict").mkdir(parents=True)
+    (strict / "strict" / "__init__.py").symlink_to(base / "strict" / "strict" / "__init__.py")
+    named = [*ours, base / "source", strict]
+    lines = [*map(str, named), *(f"import editable{name}" for name in tables)]
     (site / "all.pth").write_text("\n".join(lines))
     mine = tmp_path / "home" / ".local" / "lib" / version / "site-packages"
     mine.mkdir(parents=True)

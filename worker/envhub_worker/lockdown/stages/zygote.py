@@ -28,6 +28,9 @@ from envhub_worker.lockdown.seccomp.filter import compile_filter
 from envhub_worker.lockdown.seccomp.policy import policy_table, watched_calls
 from envhub_worker.protocol.runtime import mapped_modules
 
+_STRICT = "__editable__."
+"""The folder of links that setuptools makes in its strict mode, and puts on the path."""
+
 
 def enter(config: ZygoteConfig) -> Common:
     """Apply to this process the confinement that its jails share.
@@ -127,10 +130,20 @@ def _editable_paths() -> Iterator[str]:
         bases = [folder] if name.startswith("__init__.") else [path, *(path + e for e in suffixes)]
         yield from filter(os.path.isabs, bases)
     for folder in filter(os.path.isabs, sys.path):
+        if os.path.basename(folder).startswith(_STRICT):
+            yield from {*_linked(folder)}
         with contextlib.suppress(OSError), os.scandir(folder) as items:
             for item in filter(os.DirEntry.is_symlink, items):
                 if item.name.endswith(suffixes) or os.path.isfile(f"{item.path}/__init__.py"):
                     yield item.path
+
+
+def _linked(folder: str) -> Iterator[str]:
+    """Returns what the links in a folder lead to: modules, and the folders of packages' files."""
+    for parent, _, names in os.walk(folder):
+        for link in filter(os.path.islink, (os.path.join(parent, name) for name in names)):
+            target = os.path.realpath(link)
+            yield target if parent == folder else os.path.dirname(target)
 
 
 def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
