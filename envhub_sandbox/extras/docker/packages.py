@@ -48,6 +48,7 @@ from envhub_sandbox.extras.packages.request import PackageRequest
 from envhub_sandbox.extras.packages.resolution.resolutions import versions_for
 from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target, resolve
 from envhub_sandbox.settings.options import option_name
+from envhub_worker.protocol.text import printable
 
 _INTERPRETER = "/opt/envhub-worker/bin/python"
 """The server's interpreter in every image."""
@@ -291,7 +292,7 @@ def build(engine: Engine, recipe: str, lock: Lock, tag: str, network: str | None
             [*command, folder], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env=environment()
         )
     if done.returncode != 0:
-        output = done.stdout.decode(errors="replace")[-4000:]
+        output = printable(done.stdout.decode(errors="replace")[-4000:])  # names packages' files
         raise DependencyError(f"{engine.kind} could not build {tag}:\n{output}")
 
 

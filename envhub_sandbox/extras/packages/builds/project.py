@@ -86,7 +86,7 @@ _PROGRAM_PATTERNS = (
     r"unable to execute '([^'\s]+)': No such file",
     r"No such file or directory: '([^'\s]+)'",
     r"(?:^|\n)(?:/bin/)?sh: (?:\d+: |line \d+: )?([\w.+-]+): (?:command )?not found",
-    r"([\w+.-]+): command not found",
+    r"(?<![\w+.-])([\w+.-]+): command not found",
     r"(?i)\b(cmake|swig|cargo|rustc|pkg-config|ninja)\b[^\n]{0,40}"
     r"(?:must be installed|is required|not found|could not be found)",
 )

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import time
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -269,3 +270,9 @@ def test_no_login_follows_a_redirect(tmp_path: Path, monkeypatch: pytest.MonkeyP
         url = f"{where.replace('//', '//me:secret@')}/x"
         download.download(url, hashlib.sha256(b"data").hexdigest(), tmp_path / "x")
     assert sent == [authorization(("me", "secret")), None]
+
+
+def test_a_long_word_costs_no_search_from_each_letter() -> None:
+    began = time.process_time()
+    assert project.advice("x" * 30_000) == ""  # with one: 45 s
+    assert time.process_time() - began < 5

@@ -1,13 +1,16 @@
 """Packages for a container: whether the image has them, or this machine's fit; and images."""
 
 import json
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.extras.docker import packages
+from envhub_sandbox.extras.docker.engines import Engine
 from envhub_sandbox.extras.docker.packages import interpreter_fitting
 from envhub_sandbox.extras.packages import interpreters
 from envhub_sandbox.extras.packages.declared import parse_requirement
@@ -15,6 +18,7 @@ from envhub_sandbox.extras.packages.interpreters import InstalledPackage
 from envhub_sandbox.extras.packages.modules import Guess
 from envhub_sandbox.extras.packages.request import PackageRequest
 from envhub_sandbox.extras.packages.resolution.resolve import Lock
+from tests.attacks.output.painting import ESCAPES, paints
 from tests.support.packages.refusals import refused_dependency
 
 OURS = interpreters.own()
@@ -154,3 +158,16 @@ def test_the_recipe_is_this_one() -> None:
 def test_a_system_package_is_a_name(name: str) -> None:
     with pytest.raises(DependencyError, match="Debian"):
         packages.dockerfile("envhub-worker", LOCK, [name])
+
+
+def test_what_the_engine_prints_does_not_paint(tmp_path: Path) -> None:
+    """It prints names that packages choose, of files among others."""
+    command = tmp_path / "engine"
+    command.write_text(
+        f"#!{sys.executable}\nprint({ESCAPES!r} + 'no wheel')\nraise SystemExit(1)\n"
+    )
+    command.chmod(0o755)
+    engine = Engine("docker", str(command), "", rootless=False)
+    with pytest.raises(DependencyError, match="no wheel") as caught:
+        packages.build(engine, "FROM x", LOCK, "tag", None)
+    assert not paints(str(caught.value))
