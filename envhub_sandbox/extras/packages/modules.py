@@ -134,7 +134,9 @@ def _of_module(name: str, extras: Mapping[str, WantedPackage]) -> tuple[str, str
     from envhub_sandbox.extras.sources.parsing import of_module
 
     distributions = of_module(name)
-    names = list(map(str, map(canonicalize_name, distributions or [name.partition(".")[0]])))
+    # of its own name, too: pygame-ce is the usual one for pygame, and who declares pygame has it
+    every = [*distributions, name.partition(".")[0]]
+    names = list(map(str, map(canonicalize_name, every)))
     own = next(
         (str(extras[distribution].requirement) for distribution in names if distribution in extras),
         None,

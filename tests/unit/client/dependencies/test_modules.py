@@ -109,10 +109,15 @@ def test_it_is_installed_and_told(index: Index, tmp_path: Path) -> None:
     assert "inferred" not in strict.facts
 
 
-def test_what_a_declared_package_brings_is_declared(index: Index, tmp_path: Path) -> None:
-    make_wheel(index.folder, "declared", requires=["opencv-contrib-python"])
-    make_wheel(index.folder, "opencv-contrib-python")
-    found = snapshot(tmp_path / "r", "import cv2" + MAKE, requirements__txt="declared\n")
+@pytest.mark.parametrize(
+    ("module", "brings"), [("cv2", "opencv-contrib-python"), ("pygame", "pygame")]
+)
+def test_what_a_declared_package_brings_is_declared(
+    index: Index, tmp_path: Path, module: str, brings: str
+) -> None:
+    for name, requires in (("declared", [brings]), (brings, []), ("pygame-ce", [])):
+        make_wheel(index.folder, name, requires=requires)
+    found = snapshot(tmp_path / "r", f"import {module}" + MAKE, requirements__txt="declared\n")
     resolved = packages_for(found, chosen({}, None)[0])
     assert "inferred" not in resolved.facts
 
