@@ -24,19 +24,21 @@ Space = gym.Space[Any]
 class _Copy:
     """A copy, and the states that the jail's generators had when it was last described."""
 
-    def __init__(self, space: Space) -> None:
+    def __init__(self, space: Space, states: list[Any]) -> None:
         self.space = space
-        self._states = _states_of(space)
-
-    def follow(self, described: Space) -> Space:
-        """Take over generators that have changed in the jail, where it has seeded the space."""
-        states = _states_of(described)
-        pairs = zip(states, self._states, strict=True)
-        if any(new is not None and not equal_states(new, old) for new, old in pairs):
-            nodes = seeded_nodes(self.space), seeded_nodes(described)
-            for ours, theirs in zip(*nodes, strict=True):
-                ours._np_random = theirs._np_random or ours._np_random
         self._states = states
+
+    def follow(self, described: Space, states: list[Any]) -> Space:
+        """Take over generators that have changed in the jail, where it has seeded the space.
+        ``states``: for each node its described state, or None, or the index of another node.
+        """
+        pairs = zip(states, self._states, strict=False)
+        if any(type(new) is dict and not equal_states(new, old) for new, old in pairs):
+            nodes = seeded_nodes(self.space), seeded_nodes(described)
+            for ours, theirs, state in zip(*nodes, states, strict=True):
+                if state is not None:
+                    ours._np_random = theirs._np_random
+        self._states = states or self._states
         return self.space
 
 
@@ -46,7 +48,8 @@ class SpaceCopies:
     """
 
     def __init__(self, *single: Space) -> None:
-        self._copies = {number: _Copy(space) for number, space in enumerate(single)}
+        copies = (_Copy(space, _states_of(space)) for space in single)
+        self._copies = dict(enumerate(copies))
         self._left = MAX_BYTES
 
     def of(self, value: Any) -> Any:
@@ -58,20 +61,20 @@ class SpaceCopies:
         return {k: self.of(v) for k, v in value.items()} if type(value) is dict else value
 
     def _known(self, described: Space) -> Space:
-        number = vars(described).pop(NUMBER, None)
+        number, states = vars(described).pop(NUMBER, (None, []))
         copy = self._copies.get(number)
         if copy and type(copy.space) is type(described) and copy.space == described:
-            return copy.follow(described)
+            return copy.follow(described, states)
         if number is not None:
-            self._remember(number, described)
+            self._remember(number, _Copy(described, states))
         return described
 
-    def _remember(self, number: int, space: Space) -> None:
-        self._left -= sum(map(_bytes_of, seeded_nodes(space)))
+    def _remember(self, number: int, copy: _Copy) -> None:
+        self._left -= sum(map(_bytes_of, seeded_nodes(copy.space)))
         if self._left < 0:
             self._copies, self._left = {}, MAX_BYTES
         else:
-            self._copies[number] = _Copy(space)
+            self._copies[number] = copy
 
 
 def _states_of(space: Space) -> list[Any]:

@@ -458,9 +458,9 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         return seeds(self._requests.one_each(name, replies))
 
     @property
-    def envs(self) -> tuple[SubEnvironment, ...]:
+    def envs(self) -> list[SubEnvironment]:
         """A handle on each sub-environment, to read, to call, and to drive it by itself."""
-        return tuple(SubEnvironment(self, index) for index in range(self.num_envs))
+        return [SubEnvironment(self, index) for index in range(self.num_envs)]
 
     @property
     def sandbox(self) -> SandboxView:

@@ -136,7 +136,7 @@ def test_attributes_and_methods_of_one(make: Callable[..., Any]) -> None:
                 one.np_random,
                 one.unwrapped.spec,
             ),
-            isinstance(one, gym.Env),
+            *(isinstance(one, gym.Env), type(env.envs)),
         ]
 
     expected, actual = SyncVectorEnv(told(2)), make(told(2))
@@ -173,6 +173,7 @@ class Spaced(gym.Env[Any, Any]):
         self.observation_space, self.action_space = spaces.Box(-1, 1, (2,)), spaces.Discrete(50)
         self.by_agent = {"a": spaces.Discrete(90), "b": spaces.Discrete(90)}
         self.several = [self.by_agent["b"], self.every]
+        self.graph = spaces.Graph(spaces.Discrete(50), spaces.Discrete(3))
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         self.action_space.seed(seed)
@@ -203,6 +204,8 @@ def test_a_space_is_one_object_however_it_is_read(make: Callable[..., Any]) -> N
             one.unwrapped.several[0].seed(5)
             yield [draws(one.unwrapped.of(agent)) for agent in "ab"]
             one.unwrapped.every.seed(6)
+            one.unwrapped.graph.seed(7)
+            yield one.unwrapped.graph.sample().nodes.tolist()
         yield draws(env.single_action_space), list(map(draws, env.get_attr("every")))
         env.call("of", "a")[0].seed(7)
         yield list(map(draws, env.call("of", "a")))

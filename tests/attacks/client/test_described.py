@@ -155,7 +155,7 @@ def test_numbers_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
         copies, sent = SpaceCopies(), []
         for number in range(100):
             space = spaces.Box(0, 1, (1 << 17,), np.float32)  # its bounds take 1 MiB
-            vars(space)[NUMBER] = number
+            vars(space)[NUMBER] = number, []
             sent.append(weakref.ref(copies.of(space)))
         del space
         return sum(each() is not None for each in sent)

@@ -93,7 +93,8 @@ class SpaceReader:
             if GENERATORS in about:
                 self._start(space, about[GENERATORS], self._generator)
             if NUMBER in about:
-                vars(space)[NUMBER] = _integer(about[NUMBER], 0, MAX_INT64)
+                number = _integer(about[NUMBER], 0, MAX_INT64)
+                vars(space)[NUMBER] = number, about.get(GENERATORS, [])
             return space
         except EnvHubError:
             raise

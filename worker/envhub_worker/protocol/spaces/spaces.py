@@ -51,7 +51,9 @@ GENERATORS = "generators"
 """The key of what the generators of a space and its parts are to begin with."""
 
 NUMBER = "number"
-"""The key of a number that a space keeps, so that the client knows it again in another answer."""
+"""The key of a number that a space keeps, so that the client knows it again in another answer. In
+the client it is an attribute of the new space: the number, and the states that came with it.
+"""
 
 # Gymnasium 0.29 has none.
 OneOf: Any = getattr(spaces, "OneOf", None)
