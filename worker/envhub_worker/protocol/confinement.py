@@ -56,8 +56,8 @@ class Limits:
         file_bytes: Size of one file, or None for ``disk_bytes``.
         output_bytes: Last bytes of stdout and stderr that are kept.
         message_bytes: Size of one message from the jail; at least 64 KiB, as an error needs.
-        elements: Memory of all spaces of a repository in the client, in elements of a float32
-            ``Box`` (ten bytes each). Equal Boxes count once.
+        elements: Memory of all spaces and sub-environments of a repository in the client, in
+            elements of a float32 ``Box`` (ten bytes each). Equal Boxes count once.
     """
 
     memory_bytes: int = 8 * GIB
