@@ -428,13 +428,14 @@ def _declared_spaces(env: Any) -> list[Sequence[Any]]:
     """Each sub-environment's spaces, or the single ones of a repository's own vector class."""
     if isinstance(env, SubEnvs):
         return [(one.observation_space, one.action_space) for one in env.envs]
-    names = "single_observation_space", "single_action_space"
-    return [[getattr(env, name, None) for name in names]]
+    return [_single_spaces(env)]
 
 
 def _single_spaces(env: Any) -> list[Any]:
-    [found, *_] = _declared_spaces(env)
-    return [space for space in found if isinstance(space, gym.Space)]
+    """The single observation and action space; None where a repository's own class has none."""
+    names = "single_observation_space", "single_action_space"
+    found = (getattr(env, name, None) for name in names)
+    return [space if isinstance(space, gym.Space) else None for space in found]
 
 
 def _space_generators(env: Any) -> list[Any]:
