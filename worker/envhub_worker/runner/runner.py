@@ -434,8 +434,8 @@ def _declared_spaces(env: Any) -> list[Sequence[Any]]:
 def _single_spaces(env: Any) -> list[Any]:
     """The single observation and action space; None where a repository's own class has none."""
     names = "single_observation_space", "single_action_space"
-    found = (getattr(env, name, None) for name in names)
-    return [space if isinstance(space, gym.Space) else None for space in found]
+    declared = (getattr(env, name, None) for name in names)
+    return [space if isinstance(space, gym.Space) else None for space in declared]
 
 
 def _space_generators(env: Any) -> list[Any]:
