@@ -67,11 +67,11 @@ class Outcome:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Try each and print the table; the exit code says if all ran that run without a sandbox, and
-    of the dozen all.
+    of the few all.
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks reach", description=__doc__)
     parser.add_argument("--only", nargs="+", metavar="REF", help="these, instead of all")
-    parser.add_argument("--quick", action="store_true", help="the dozen that CI tries")
+    parser.add_argument("--quick", action="store_true", help="the few that CI tries")
     parser.add_argument("--write", action="store_true", help=f"write the table into {_PAGE.name}")
     parser.add_argument("--client", default=sys.executable, help="an interpreter that has us")
     parser.add_argument("--deadline", type=float, default=600.0, help="seconds of each process")
