@@ -19,7 +19,7 @@ tests+=(tests/attacks/packages/test_{builds,packages}.py)
 tests+=(tests/integration/confinement tests/integration/lifecycle/test_{lingering,odd_starts}.py)
 tests+=(tests/integration/packages/test_builds.py)
 tests+=(tests/unit/worker/{lockdown,spawn,access/store,test_file_access.py})
-tests+=(tests/unit/client/{system,hub/test_{store,local}.py,sources/test_checkout.py,sandboxes/test_{process,pool}.py})
+tests+=(tests/unit/client/{system/test_{folders,locks,processes}.py,hub/test_{store,local}.py,sources/test_checkout.py,sandboxes/test_{process,pool}.py})
 
 # part NUMBER ARGUMENT...: these tests, by one process of a user of their own: some limits count what a
 # user runs, and two processes would count each other's. What the step "tests" installed serves here
