@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import itertools
 import json
 import os
 import platform
@@ -38,6 +39,7 @@ _ASK_S = 60.0
 _FIND_S = 120.0
 _FETCH_S = 600.0
 _OLDEST = SpecifierSet(">=3.10")
+_RELEASES = tuple(itertools.product(range(10, 100), range(30)))
 _ASK = (
     "import json, os, platform, sys; print(json.dumps([sys.implementation.name,"
     " platform.python_version(), os.uname().machine, platform.libc_ver()[1],"
@@ -103,9 +105,16 @@ def find(python: str, declared: str = "", *, fetch: bool = False) -> Interpreter
         interpreters = _others(wanted)
     if interpreters:
         return interpreters[0]
-    why = f"you ask for Python {python!r}" if python else f"it runs in Python {declared}"
+    asked = [f"you ask for Python {python!r}"] if python else []
+    why = " and ".join([*asked, *([f"it runs in Python {declared}"] if declared else [])])
     named = option_name("dependencies", {"python": "/path/to/python3"})
-    fetched = option_name("dependencies", {"python": python or "3.12", "fetch_python": True})
+    if not any(wanted.contains(f"3.{minor}.{patch}") for minor, patch in _RELEASES):
+        raise DependencyError(
+            f"{why}; with jails in 3.10 or later, no release fits. To try another one all the "
+            f"same, name its path: {named}",
+            reason="interpreter",
+        )
+    fetched = option_name("dependencies", {"python": python or declared, "fetch_python": True})
     raise DependencyError(
         f"{why}, and this machine has no such interpreter of 3.10 or later; this one is "
         f"{ours.version} ({ours.path}). Install one ('uv python install'), let uv download it with "

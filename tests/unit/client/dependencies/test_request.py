@@ -179,7 +179,15 @@ def test_no_interpreter_is_an_error_that_says_what_to_do(
     (tmp_path / "versions/3.99.0/bin/python3").write_text("")
     monkeypatch.setenv("PYENV_ROOT", pyenv.format(tmp_path))
     monkeypatch.setenv("PATH", os.path.dirname(interpreters.own().path))  # each there is asked
-    with refused_dependency("interpreter", match=r"uv python install"):
+    with refused_dependency("interpreter", match=rf"uv python install.*{asked or declared}', 'f"):
+        interpreters.find(asked, declared)
+
+
+@pytest.mark.parametrize(
+    ("asked", "declared"), [("", ">=3.8,<3.10"), ("3.12", "<3.12"), ("3.9", "")]
+)
+def test_no_download_is_advised_where_no_release_fits(asked: str, declared: str) -> None:
+    with refused_dependency("interpreter", match=r"no release fits.*path/to/python3'}$"):
         interpreters.find(asked, declared)
 
 
