@@ -69,7 +69,7 @@ error observation-space
     Cure: Clip the observations, or widen the space.
 error observation-dtype
     Each sub-environment returns observations with the dtype and shape of its space. (Gymnasium
-    casts them into a batch, which hides a difference.)
+    casts them into a batch, which hides a difference.) So do a vector class's own batches.
     Cure: Return the dtype of observation_space: for a float32 Box, np.asarray(..., np.float32).
 error observation-finite
     Observations have no NaN and no infinity, also if the space has no bounds.

@@ -116,6 +116,24 @@ def test_a_dtype_that_changes_late_in_an_episode_is_found(tmp_path: Path) -> Non
     assert finding.id == "observation-dtype"
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "checks"),
+    [
+        ("", "", set()),
+        (".astype(np.float32)", "", {"observation-dtype"}),
+        ("self.seen(), rewards", "self.seen(), rewards[:, None]", {"step-types"}),
+    ],
+    ids=["control", "dtype", "column"],
+)
+def test_batches_of_a_vector_class_are_looked_at(
+    old: str, new: str, checks: set[str], tmp_path: Path
+) -> None:
+    text = HONEST["a batch in NumPy"].source()
+    assert old in text
+    report = judged(repository(tmp_path / "walk", text.replace(old, new)), resets=0)
+    assert {one.id for one in report.failures(Severity.ERROR)} == checks
+
+
 def test_each_mode_that_is_declared_is_rendered(tmp_path: Path) -> None:
     """Where make_env takes one; the control is the honest one of the corpus."""
     text = HONEST["several modes of rendering"].source()

@@ -341,31 +341,41 @@ class TaskJudge:
         """Check the results of one sub-environment before Gymnasium writes them into a batch."""
         uncast: list[str] = []
         types: dict[str, str] = {}  # the first fault of each part
-        handles = getattr(self._env, "envs", None)
+        env: Any = self._env
+        try:
+            self._drive(env.envs[0], uncast, types)
         # a vector class without sub-environments that can be stepped raises one of these
-        with contextlib.suppress(AttributeError, TypeError, ValueError, NotImplementedError):
-            if handles:
-                self._drive(handles[0], uncast, types)
+        except (AttributeError, IndexError, TypeError, ValueError, NotImplementedError):
+            self._drive_batch(uncast, types)
         self._say("observation-dtype", uncast[:1])
         self._say("step-types", types.values())
 
     def _drive(self, handle: Any, uncast: list[str], types: dict[str, str]) -> None:
         """Play one episode, because many a fault is in its last step alone."""
-        uncast += self._outside(handle.reset(seed=self._asked.seed)[0])
+        space, who = self._env.single_observation_space, "sub-environment 0"
+        uncast += _outside(who, space, handle.reset(seed=self._asked.seed)[0])
         for _ in range(self._asked.steps):
             result = handle.step(self._env.single_action_space.sample())
-            uncast += self._outside(result[0])
+            uncast += _outside(who, space, result[0])
             for part, text in _untyped(*result[1:]):
                 types.setdefault(part, text)
             if np.any(result[2]) or np.any(result[3]):
                 return
 
-    def _outside(self, observation: Any) -> Iterator[str]:
-        space = self._env.single_observation_space
-        with contextlib.suppress(CustomSpaceError):  # the space's code is not in this process
-            if _would_be_cast(observation, space) or not space.contains(observation):
-                shown = batches.shown(observation)
-                yield f"sub-environment 0 gave {shown}, which is not in {space}"
+    def _drive_batch(self, uncast: list[str], types: dict[str, str]) -> None:
+        """Step once: what a vector class of the repository's own returns is not cast."""
+        space = self._env.observation_space
+        uncast += _outside("reset", space, self._env.reset(seed=self._asked.seed)[0])
+        observations, rewards, *_ = self._env.step(self._env.action_space.sample())
+        uncast += _outside("step", space, observations)
+        if np.ndim(rewards) > 1 and np.size(rewards) == self._env.num_envs:
+            types["reward"] = f"the rewards are {_seen(rewards)}, not one number each"
+
+
+def _outside(who: str, space: spaces.Space[Any], observation: Any) -> Iterator[str]:
+    with contextlib.suppress(CustomSpaceError):  # the space's code is not in this process
+        if _would_be_cast(observation, space) or not space.contains(observation):
+            yield f"{who} gave {batches.shown(observation)}, which is not in {space}"
 
 
 def _would_be_cast(value: Any, space: spaces.Space[Any]) -> bool:
