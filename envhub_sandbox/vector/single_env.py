@@ -10,7 +10,7 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Sequence
 from copy import copy
-from typing import Any, SupportsFloat
+from typing import Any, SupportsFloat, cast
 
 import gymnasium as gym
 import numpy as np
@@ -115,11 +115,18 @@ class SingleEnv(gym.Env[Any, Any]):
             return begun
         if self._apart is not None:
             batch, infos = self._apart.reset(seed, options)
+            self._follow_spaces()
         else:
             batch, infos = self._vector.reset(seed=seed, options=options)
         with UNTRUSTED:
             [info, *_], scalars, _ = self._own(infos)
             return self._first(batch, scalars), info
+
+    def _follow_spaces(self) -> None:
+        """Show the spaces that the environment has now, if a reset has replaced them."""
+        for name, space in cast("SandboxVectorEnv", self._vector)._first_spaces.items():
+            if self.__dict__[name] != space:
+                self.__dict__[name] = space
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step with ``action``, an element of ``action_space``.

@@ -15,6 +15,7 @@ from functools import partial
 from threading import get_ident
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
+import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 
@@ -85,6 +86,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         self._timeouts = session.repository.timeouts
         self._read_actions = action_reader(manifest, manifest.num_envs)
         self._generators = Generators(self._requests)
+        self._first_spaces: dict[str, gym.Space[Any]] = {}  # if a reset has changed them
         self._spaces = SpaceCopies(manifest.single_observation_space, manifest.single_action_space)
         self._still: Any = None  # the last picture of the first sub-environment, for notebooks
         self.single_observation_space = manifest.single_observation_space
@@ -241,13 +243,16 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         return done
 
     def _follow_spaces(self) -> None:
-        """Have the single spaces draw as those that a reset has seeded. Those of an
-        ``AsyncVectorEnv`` belong to no sub-environment, unless it is shown as a single one.
+        """Have the single spaces draw as those that a reset has seeded, and note the present ones.
+        Those of an ``AsyncVectorEnv`` belong to no sub-environment, unless it is shown as a single
+        one.
         """
         if self._manifest.sync or self._requests.results.single:
             with suppress(*SAID_NEXT):
                 for name in ("observation_space", "action_space"):
-                    self.envs[0]._get(name)
+                    space = self.envs[0]._get(name)
+                    if isinstance(space, gym.Space):
+                        self._first_spaces[name] = space
 
     def step(self, actions: Any) -> StepResult:
         """Step every sub-environment.

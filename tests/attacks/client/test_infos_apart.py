@@ -9,13 +9,16 @@ from typing import Any
 import cloudpickle
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.session.lease import AttributeCache
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.vector.single_env import SingleEnv
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
+from envhub_worker.runner.described import described
 from tests.attacks.client.lies import (
     GROWTH,
     Canary,
@@ -119,6 +122,20 @@ def test_columns_take_no_more_memory_than_their_message_may(lie: dict[Any, Any])
             results.infos([lie, {}])
 
     assert peak_growth(read) < GROWTH
+
+
+def test_only_a_space_is_shown_as_one(
+    liar: LyingServer, folder: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a reset that is said to have replaced the spaces; the control is a space."""
+    monkeypatch.setattr(AttributeCache, "take_seeded", lambda cache: True)
+    with _single(liar, folder) as env:
+        for value, shown in (("text", ACTION), ({"n": 1}, ACTION), (spaces.Discrete(9),) * 2):
+            frames = m.pack(m.Value(value), describer=described)
+            liar.lies[m.GetOne] = relayed([bytes(frame) for frame in frames])
+            env.reset()
+            assert env.action_space == shown
+            assert env.vector.single_action_space == ACTION
 
 
 def test_pickles_in_infos_are_never_loaded(liar: LyingServer, folder: str, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from envhub_sandbox.errors import ActionError, LoadError
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from tests.support.compare import assert_same
-from tests.support.repositories import write_repository
+from tests.support.repositories import STILL, write_repository
 from tests.support.samples import EXAMPLES, make_env_of
 
 _ID = "envhub_sandbox.integrations.gym:Hub-v0"
@@ -485,3 +485,30 @@ def test_an_action_arrives_as_it_is(tmp_path: Path, kind: str, lane: str) -> Non
         env.action_space.seed(3)
         for action in (*given[kind], *(env.action_space.sample() for _ in range(3))):
             assert env.step(action)[4] == here.step(action)[4]
+
+
+_GROWING = """
+class Growing(Still):
+    def reset(self, *, seed=None, options=None):
+        if options:
+            self.action_space = gym.spaces.Discrete(options["size"], seed=seed)
+        return 0, {}
+"""
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_a_space_that_a_reset_replaces_is_seen(tmp_path: Path, lane: str) -> None:
+    """With its seed; another reset leaves the caller's copy as it is."""
+    folder = write_repository(tmp_path / "growing", STILL + _GROWING)
+    seen = []
+    with contextlib.closing(SandboxEnv(folder, policy={"lane": lane})) as env:
+        for each in (make_env_of(folder)().envs[0], env):
+            each.reset()
+            spaces = [str(each.action_space)]
+            each.reset(seed=3, options={"size": 50})
+            own = each.action_space
+            draws = [own.sample() for _ in range(3)]
+            each.reset()
+            spaces += [str(own), str(each.action_space is own)]
+            seen.append([*spaces, *draws, own.sample()])
+    assert seen[0] == seen[1]

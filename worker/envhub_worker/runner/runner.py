@@ -7,6 +7,7 @@ stream.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import select
@@ -121,7 +122,7 @@ class Runner:
         play_bytes: int = 1 << 30,
     ) -> None:
         self._numbers = SpaceNumbers()
-        self._space_generators: dict[int, list[Any]] = {}  # of the first sub-environments
+        self._first_spaces: dict[int, tuple[list[Any], list[Any]]] = {}  # and their generators
         self._pack = partial(m.pack, describer=partial(numbered, self._numbers), limits=limits)
         self._pack_infos = partial(m.pack, describer=described, limits=limits, reduces=True)
         self._snapshot = snapshot
@@ -231,7 +232,7 @@ class Runner:
             shared.built(env.envs)
         self._numbers.built(_declared_spaces(env), request.start)
         if not request.start:
-            self._space_generators[request.env] = _space_generators(env)
+            self._first_spaces[request.env] = _first_spaces(env)
         return m.BuildDone(encode_env(manifest.describe_vector(task, env)))
 
     def reset(self, request: m.Reset) -> m.Message:
@@ -253,13 +254,17 @@ class Runner:
         return m.ResetDone(*compat.reset_result(env, result))
 
     def _note_seeded(self, number: int, env: Any) -> None:
-        """Tell the client if a reset has seeded the spaces that it shows as the vector's own."""
-        before = self._space_generators.get(number)
-        now = _space_generators(env)
-        if before is None or list(map(id, before)) == list(map(id, now)):
+        """Tell the client if a reset has seeded or replaced the first sub-environment's spaces."""
+        before = self._first_spaces.get(number)
+        if before is None:
             return
-        self._space_generators[number] = now  # kept, so that no other one gets its id
-        if any(map(seeded_states, _single_spaces(env))):
+        # kept, so that no other object gets an id of theirs
+        spaces, generators = self._first_spaces[number] = _first_spaces(env)
+        seeded = list(map(id, generators)) != list(map(id, before[1]))
+        replaced = True
+        with contextlib.suppress(Exception):  # a custom space may compare itself in any way
+            replaced = spaces != before[0]
+        if replaced or (seeded and any(map(seeded_states, spaces))):
             self.watches.changed[number, m.SPACES] = None
 
     def step(self, request: m.Step) -> m.Message:
@@ -415,7 +420,7 @@ class Runner:
         # by then.
         env = self._envs.pop(request.env, None)
         self._generators.pop(request.env, None)
-        self._space_generators.pop(request.env, None)
+        self._first_spaces.pop(request.env, None)
         self.watches.forget(request.env)
         if request.env in self.lanes:
             self.forget_lane(self.lanes[request.env])
@@ -438,10 +443,13 @@ def _single_spaces(env: Any) -> list[Any]:
     return [space if isinstance(space, gym.Space) else None for space in declared]
 
 
-def _space_generators(env: Any) -> list[Any]:
-    """The generators of the single spaces and of their parts; None where there is none yet."""
-    nodes = itertools.chain.from_iterable(map(seeded_nodes, _single_spaces(env)))
-    return [getattr(node, "_np_random", None) for node in nodes]
+def _first_spaces(env: Any) -> tuple[list[Any], list[Any]]:
+    """The first sub-environment's spaces, or the single ones, and the generators of their parts."""
+    spaces = _single_spaces(env)
+    if isinstance(env, SubEnvs):
+        spaces = [env.envs[0].observation_space, env.envs[0].action_space]
+    nodes = itertools.chain.from_iterable(map(seeded_nodes, spaces))
+    return spaces, [getattr(node, "_np_random", None) for node in nodes]
 
 
 def _call_own(env: Any, method: str, *args: Any, **kwargs: Any) -> Any:

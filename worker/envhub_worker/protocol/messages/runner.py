@@ -19,7 +19,9 @@ NEW_ROLLOUT = "lerobot_new_rollout"
 
 
 SPACES = "<spaces>"
-"""In place of an attribute in ``Changes``: a reset has seeded the vector's single spaces."""
+"""In place of an attribute in ``Changes``: a reset has seeded or replaced the spaces of the first
+sub-environment.
+"""
 
 
 class Load(Message, kind=64, asks="make_env", handed=("cfg", "env_kwargs")):
