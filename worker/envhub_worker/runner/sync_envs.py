@@ -258,7 +258,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         observations replace those, too. In a rollout they freeze there.
         """
         if rollout:
-            self.driven = [FreezingEnv(one, cut=True) for one in self.envs]
+            self.driven = [FreezingEnv(env, cut=True) for env in self.envs]
         infos = self.run_reset(seeds, {NEW_ROLLOUT: True} if rollout else None, None)
         self.batch.rewards[...] = 0.0
         self.batch.truncations[...] = True
