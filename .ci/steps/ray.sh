@@ -7,11 +7,11 @@ python=$(find_python 3.11 || command -v python3)
 [ "$(id -u)" != 0 ] || [ ! -x /usr/bin/python3 ] || python=/usr/bin/python3
 built=$(wheel)
 make_venv "$python" "$CI_WORK/ray"
-if ! install_into "$CI_WORK/ray" --compile-bytecode "$built[ray]"; then
+if ! install_into "$CI_WORK/ray" "$built[ray]"; then
   echo "Ray cannot be installed here, and its tests are not run" | tee "$CI_WORK/ray.summary"
   exit 0
 fi
-install_into "$CI_WORK/ray" --compile-bytecode --group test
+install_into "$CI_WORK/ray" --group short
 copy_tests "$CI_WORK/ray/checkout"
 cd "$CI_WORK/ray/checkout"
 export ENVHUB_CI=1 RAY_USAGE_STATS_ENABLED=0
