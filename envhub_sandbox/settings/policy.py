@@ -286,7 +286,7 @@ _LEAST_LIMITS = {
     "open_files": 32,
     "disk_bytes": 1 << 16,
     "disk_files": 100,
-    "message_bytes": 1 << 16,
+    "message_bytes": 1 << 20,
 }
 """With less, no jail starts, or one cannot say why it does not."""
 

@@ -74,7 +74,11 @@ def _limit(name: str, value: object, takes: str = "") -> Any:
         _limit("disk_bytes", "1X", "; it takes a size"),
         *(
             _limit(name, least - 1, f"; it takes a whole number, {least} or more")
-            for name, least in {"message_bytes": 65536, "disk_files": 100, "open_files": 32}.items()
+            for name, least in {
+                "message_bytes": 1 << 20,
+                "disk_files": 100,
+                "open_files": 32,
+            }.items()
         ),
         (lambda: Timeouts(step_s=0), "step_s is 0; it takes seconds above 0, or None"),
         (lambda: Timeouts(step_s=-1.0), "step_s is -1.0"),

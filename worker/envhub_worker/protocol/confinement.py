@@ -55,7 +55,7 @@ class Limits:
         disk_files: Files and folders in that scratch.
         file_bytes: Size of one file, or None for ``disk_bytes``.
         output_bytes: Last bytes of stdout and stderr that are kept.
-        message_bytes: Size of one message from the jail; at least 64 KiB, as an error needs.
+        message_bytes: Size of one message from the jail; at least 1 MiB, as an error may need.
         elements: Memory of all spaces and sub-environments of a repository in the client, in
             elements of a float32 ``Box`` (ten bytes each). Equal Boxes count once.
     """
