@@ -86,6 +86,10 @@ class Checkout(Protocol):
     def tracked(self) -> frozenset[str]:
         """The files that git tracks already."""
 
+    @property
+    def programs(self) -> frozenset[str] | None:
+        """The executable files, if git does not look at the modes of the folder."""
+
     def tracks_below(self, folder: str) -> bool:
         """Whether git tracks a file in a folder."""
 
@@ -303,7 +307,10 @@ class LocalFolder:
                 text = os.fsencode(os.readlink(path))
                 yield LocalFile(name, path, len(text), link=text)
             elif name in checkout.tracked or os.access(path, os.R_OK):
-                yield LocalFile.at(name, path)
+                file, programs = LocalFile.at(name, path), checkout.programs
+                if programs is not None and name in checkout.tracked:
+                    file = file._replace(executable=name in programs)
+                yield file
             else:  # a tracked file is never left out, since a commit has it
                 yield LeftOut(name, _UNREADABLE)
 

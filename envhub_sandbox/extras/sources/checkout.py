@@ -36,6 +36,9 @@ _CONVERSIONS = ("filter", "ident", "working-tree-encoding")
 _SHA256 = r"(?im)^\s*objectformat\s*=\s*\"?sha256"
 """Marks SHA-256 ids in git's configuration; git would misread such an index without an error."""
 
+_MODELESS = r"(?im)^\s*filemode\s*=\s*\"?(false|no|off|0)\b"
+"""Marks a checkout, as of Windows, whose index says which files are executable."""
+
 
 class _Repository(NamedTuple):
     """A checkout's top folder, its git folder, and the git folder that its worktrees share."""
@@ -44,6 +47,7 @@ class _Repository(NamedTuple):
     own: Path
     common: Path
     is_sha256: bool
+    is_modeless: bool
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,15 @@ class Checkout:
     def tracked(self) -> frozenset[str]:
         """Returns the files that git knows already."""
         return self.files - self.untracked
+
+    @cached_property
+    def programs(self) -> frozenset[str] | None:
+        """Returns the executable files of the index; None if those of the folder count."""
+        if not self._repository.is_modeless:
+            return None
+        output = _git(self._repository, self.folder, "ls-files", "-z", "--stage") or b""
+        rows = (row for row in output.split(b"\0") if row.startswith(b"100755"))
+        return frozenset(os.fsdecode(row.partition(b"\t")[2]) for row in rows)
 
     def tracks_below(self, folder: str) -> bool:
         """Tells whether git knows a file below a folder."""
@@ -173,12 +186,13 @@ def _repository_of(folder: Path) -> _Repository | None:
             own = top / path.strip() if kind == "gitdir" else own
         common = own / _text_of(own / "commondir").strip()
         is_one = (own / "HEAD").is_file() and (common / "objects").is_dir()
-        is_sha256 = re.search(_SHA256, _text_of(common / "config")) is not None
+        config = _text_of(common / "config")
+        marks = [re.search(mark, config) is not None for mark in (_SHA256, _MODELESS)]
         owners = (folder.stat().st_uid, user_id(), 0)
         is_trusted = (top / ".git").lstat().st_uid in owners
     except (OSError, ValueError):  # also for a path with a null byte
         return None
-    return _Repository(top, own, common, is_sha256) if is_one and is_trusted else None
+    return _Repository(top, own, common, *marks) if is_one and is_trusted else None
 
 
 def _text_of(file: Path) -> str:

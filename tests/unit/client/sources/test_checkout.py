@@ -111,6 +111,20 @@ def test_a_link_is_a_file_with_its_text(repository: GitRepository) -> None:
     assert links.items() <= files(repository.folder).items()
 
 
+@pytest.mark.parametrize(("looks", "programs"), [("true", ["new"]), ("false", ["game", "new"])])
+def test_the_index_says_what_is_executable_where_git_looks_at_no_modes(
+    repository: GitRepository, looks: str, programs: list[str]
+) -> None:
+    """As in a checkout on Windows; of a file that git does not know yet, its mode counts."""
+    for name in ("game", "new"):
+        (repository.folder / name).write_text("#!/bin/sh")
+        (repository.folder / name).chmod(0o755)
+    repository.git("add", "game")
+    (repository.folder / "game").chmod(0o644)
+    repository.git("config", "core.fileMode", looks)
+    assert [file.path for file in local(repository.folder).files if file.executable] == programs
+
+
 def test_a_virtual_environment_is_left_out_unless_committed(repository: GitRepository) -> None:
     """Who made one here forgot to have git ignore it; a commit may hold what it likes."""
     (repository.folder / "mine/bin").mkdir(parents=True)
