@@ -150,9 +150,13 @@ class Failures:
         timeout_s, states = deadline.timeout_s, self._lease.states()
         WORKER.info("%s: no answer to %s after %s s", self._label, operation, timeout_s)
         busy = f" (its processes: {', '.join(states)})" if states else ""
+        option = f"{operation}_s" if operation in ("reset", "step") else "call_s"
+        longer = ""
+        if timeout_s and timeout_s == getattr(self._lease.repository.timeouts, option):
+            longer = f"; {option_name(option, 2 * timeout_s)} waits longer"
         error = WorkerTimeoutError(
             f"{operation} has not finished after {timeout_s} s{busy}; reset() brings the "
-            "environment back, in a fresh process if it still does not answer",
+            f"environment back, in a fresh process if it still does not answer{longer}",
             request=operation,
             timeout_s=timeout_s,
         )
