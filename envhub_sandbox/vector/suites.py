@@ -187,7 +187,8 @@ def choose(
     if len(chosen) == 1:
         return suites[chosen[0][0]][chosen[0][1]]
     if chosen:
-        raise ValueError(f"there are {len(chosen)} environments; choose one: {_names(chosen)}")
+        many = f"there are {len(chosen)} environments"
+        raise ValueError(f"{many}; choose one by suite and task: {_names(chosen)}")
     available = _names(_named(suites))
     named = [("suite", suite), ("task", task)]
     wanted = " with a ".join(f"{word} {name!r}" for word, name in named if name is not None)
