@@ -139,7 +139,7 @@ def _own_infos(env: Any, method: str, infos: Any) -> Any:
         return infos
     mappings = isinstance(infos, (list, tuple)) and all(isinstance(info, dict) for info in infos)
     if not mappings or len(infos) != env.num_envs:
-        raise _misfit(env, method, f"returns infos that are a {type(infos).__name__}, not a dict")
+        raise _misfit(env, method, f"returns infos of type {type(infos).__name__}, not a dict")
     return batches.join_pairs([(i, info) for i, info in enumerate(infos) if info], len(infos))
 
 
