@@ -64,8 +64,8 @@ def _server() -> Iterator[None]:
     stop_idle()
     before = descendants()
     use = PROCESS.acquire(cache_root() / "snapshots")
-    with make_env(sample("counter")):
-        pass  # its zygote is up
+    with make_env(sample("counter")) as suites:
+        suites.env.reset()  # so that its zygote is up, also if the manifest is remembered
     yield
     use.release()
     # what is interrupted in its start gives the server back a moment later, and that lingers
