@@ -85,10 +85,18 @@ make_venv() {
   [ $# = 2 ] || install_into "${@:2}"
 }
 
-# wheel: the wheel that the step "tests" built, or one built now.
+# checkout_of_tests FOLDER: a copy of what the step "tests" tests, if its installation is complete. With
+# times, by which its bytecode is known; again if a test that runs meanwhile has removed a file.
+checkout_of_tests() {
+  grep -q '^== [0-9]* s: testing ' "$CI_WORK/tests.log" 2>/dev/null || return
+  cp -Rp "$CI_WORK/tests/checkout" "$1" || { rm -rf "$1" && cp -Rp "$CI_WORK/tests/checkout" "$1"; } || exit
+  rm -rf "$1/.pytest_cache"
+}
+
+# wheel: the wheel that was built for all steps, or one built now.
 wheel() {
   local found
-  found=$(ls "$CI_WORK"/tests/dist/*.whl "$CI_WORK"/dist/*.whl 2>/dev/null | head -1) || true
+  found=$(ls "$CI_WORK"/dist/*.whl 2>/dev/null) || true
   if [ -z "$found" ]; then
     "$CI_UV" build --quiet --wheel --out-dir "$CI_WORK/dist" . >&2
     found=$(ls "$CI_WORK"/dist/*.whl)

@@ -68,8 +68,8 @@ ln -sf "$CI_WORK"/deployment/lib/python*/site-packages/compose/docker-compose \
 docker compose version
 
 export ENVHUB_CI=1 ENVHUB_TEST_IMAGE=$image
-if [ -x "$CI_WORK/tests/venv/bin/python" ]; then
-  cd "$CI_WORK/tests/checkout"
+if checkout_of_tests "$CI_WORK/container"; then
+  cd "$CI_WORK/container"
   with_summary container bash "$CI_AGAIN" "$CI_WORK/tests/venv/bin/python" -m pytest -n 2 --dist loadfile \
     --durations=20 tests/containers
 else

@@ -25,13 +25,12 @@ tests+=(tests/unit/client/{system/test_{folders,locks,processes}.py,hub/test_{st
 # user runs, and two processes would count each other's. What the step "tests" installed serves here
 # too: it is the same interpreter.
 part() {
-  local number=$1 made=$CI_WORK/tests
+  local number=$1
   local again=(bash "$CI_STEPS/../as-user.sh" "$number" bash "$CI_AGAIN")
   shift
-  if [ -x "$made/venv/bin/python" ]; then
-    cp -Rp "$made/checkout" "$CI_WORK/user-$number"  # with times, by which its bytecode is known
+  if checkout_of_tests "$CI_WORK/user-$number"; then
     cd "$CI_WORK/user-$number"
-    with_summary "user-$number" "${again[@]}" "$made/venv/bin/python" -m pytest -n 1 \
+    with_summary "user-$number" "${again[@]}" "$CI_WORK/tests/venv/bin/python" -m pytest -n 1 \
       --one-case "$@"
   else
     cp -R . "$CI_WORK/user-$number"
