@@ -18,6 +18,8 @@ from envhub_worker.protocol.spaces.spaces import NUMBER, seeded_nodes
 MAX_BYTES = 64 << 20
 """How much a worker may have the client remember; with more, it begins anew."""
 _NODE_BYTES = 4096
+_PLAIN = frozenset({bool, bytes, float, int, np.ndarray, str, type(None)})
+"""Classes of values that contain no space. A long list of them is not walked."""
 Space = gym.Space[Any]
 
 
@@ -56,9 +58,13 @@ class SpaceCopies:
         """A worker's answer, in which known spaces are the caller's copies of them."""
         if isinstance(value, gym.Space):
             return self._known(value)
-        if type(value) in (list, tuple):
-            return type(value)(map(self.of, value))
-        return {k: self.of(v) for k, v in value.items()} if type(value) is dict else value
+        kind = type(value)
+        items = value.values() if kind is dict else value if kind in (list, tuple) else ()
+        if _PLAIN.issuperset(map(type, items)):
+            return value
+        if kind is dict:
+            return {key: self.of(item) for key, item in value.items()}
+        return kind(map(self.of, value))
 
     def _known(self, described: Space) -> Space:
         number, states = vars(described).pop(NUMBER, (None, []))
