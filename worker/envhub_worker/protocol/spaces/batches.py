@@ -378,9 +378,10 @@ def forms_of(info: dict[Any, Any]) -> Forms:
     """
     forms: Forms = {}
     for key, value in info.items():
-        inner = forms_of(value) if isinstance(value, dict) else {}
-        casts = _casts(value)
-        if inner or casts or type(key) is not str or type(value) not in _SAME:
+        inner = forms_of(value) if isinstance(value, dict) else _NO_FORMS
+        is_same = type(value) in _SAME
+        casts = _casts(value) if type(value) is np.ndarray or not is_same else _NO_FORMS
+        if inner or casts or type(key) is not str or not is_same:
             is_array = isinstance(value, (dict, np.ndarray)) or is_scalar(type(value))
             forms[key] = (f"_{key}", not is_array, inner, casts)
     return forms
@@ -398,8 +399,7 @@ def _casts(value: Any) -> Forms:
     kind = type(value)
     if isinstance(value, np.ndarray):
         return {"V": np.zeros(1, value.dtype)} if value.dtype.names else {}
-    is_text = kind in _SAME or hasattr(kind, "__array__")
-    if is_text or not any(hasattr(kind, name) for name in _CONVERTERS):
+    if hasattr(kind, "__array__") or not any(hasattr(kind, name) for name in _CONVERTERS):
         return {}
     casts: Forms = {}
     for name, number in _CASTS.items():
