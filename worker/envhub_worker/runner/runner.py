@@ -13,7 +13,7 @@ import os
 import select
 import socket
 from array import array
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from time import monotonic
 from typing import Any
@@ -429,25 +429,21 @@ class Runner:
         return m.Value(None)
 
 
-def _declared_spaces(env: Any) -> list[Sequence[Any]]:
-    """Each sub-environment's spaces, or the single ones of a repository's own vector class."""
+def _declared_spaces(env: Any) -> Iterator[list[Any]]:
+    """Yields each sub-environment's observation and action space; of a repository's own vector
+    class its single ones, and None in place of what is no space.
+    """
     if isinstance(env, SubEnvs):
-        return [(one.observation_space, one.action_space) for one in env.envs]
-    return [_single_spaces(env)]
-
-
-def _single_spaces(env: Any) -> list[Any]:
-    """The single observation and action space; None where a repository's own class has none."""
+        yield from ([sub.observation_space, sub.action_space] for sub in env.envs)
+        return
     names = "single_observation_space", "single_action_space"
     declared = (getattr(env, name, None) for name in names)
-    return [space if isinstance(space, gym.Space) else None for space in declared]
+    yield [space if isinstance(space, gym.Space) else None for space in declared]
 
 
 def _first_spaces(env: Any) -> tuple[list[Any], list[Any]]:
     """The first sub-environment's spaces, or the single ones, and the generators of their parts."""
-    spaces = _single_spaces(env)
-    if isinstance(env, SubEnvs):
-        spaces = [env.envs[0].observation_space, env.envs[0].action_space]
+    spaces = next(_declared_spaces(env))
     nodes = itertools.chain.from_iterable(map(seeded_nodes, spaces))
     return spaces, [getattr(node, "_np_random", None) for node in nodes]
 
