@@ -39,7 +39,6 @@ _ASK_S = 60.0
 _FIND_S = 120.0
 _FETCH_S = 600.0
 _OLDEST = SpecifierSet(">=3.10")
-_RELEASES = tuple(itertools.product(range(10, 100), range(30)))
 _ASK = (
     "import json, os, platform, sys; print(json.dumps([sys.implementation.name,"
     " platform.python_version(), os.uname().machine, platform.libc_ver()[1],"
@@ -108,7 +107,8 @@ def find(python: str, declared: str = "", *, fetch: bool = False) -> Interpreter
     asked = [f"you ask for Python {python!r}"] if python else []
     why = " and ".join([*asked, *([f"it runs in Python {declared}"] if declared else [])])
     named = option_name("dependencies", {"python": "/path/to/python3"})
-    if not any(wanted.contains(f"3.{minor}.{patch}") for minor, patch in _RELEASES):
+    releases = itertools.product(range(10, 100), range(30))
+    if not any(wanted.contains(f"3.{minor}.{patch}") for minor, patch in releases):
         raise DependencyError(
             f"{why}; with jails in 3.10 or later, no release fits. To try another one all the "
             f"same, name its path: {named}",
