@@ -11,13 +11,17 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 
 from envhub_sandbox.vector.generators import equal_states
+from envhub_worker.protocol.spaces.reader import CHARACTER_BYTES
 from envhub_worker.protocol.spaces.spaces import NUMBER, seeded_nodes
 
 MAX_BYTES = 64 << 20
 """How much a worker may have the client remember; with more, it begins anew."""
 _NODE_BYTES = 4096
+_KEY_BYTES = 16
+"""For each character of a Dict's keys as they are printed: most of a tuple's small numbers."""
 _PLAIN = frozenset({bool, bytes, float, int, np.ndarray, str, type(None)})
 """Classes of values that contain no space. A long list of them is not walked."""
 Space = gym.Space[Any]
@@ -89,5 +93,8 @@ def _states_of(space: Space) -> list[Any]:
 
 
 def _bytes_of(node: Space) -> int:
+    """Returns at least what a node takes; its arrays, characters and keys may be large."""
     arrays = (part.nbytes for part in vars(node).values() if isinstance(part, np.ndarray))
-    return _NODE_BYTES + sum(arrays)
+    characters = len(node.character_set) if isinstance(node, spaces.Text) else 0
+    keys = len(repr([*node.spaces])) if isinstance(node, spaces.Dict) else 0
+    return _NODE_BYTES + sum(arrays) + CHARACTER_BYTES * characters + _KEY_BYTES * keys

@@ -3,6 +3,7 @@ The controls make of the same fields what they ask for: there memory is asked fo
 command runs, and what one message may cost is not what its parts cost one by one."""
 
 import weakref
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -148,18 +149,30 @@ def test_a_number_makes_no_space_another(liar: LyingServer, folder: str) -> None
             assert env.single_action_space is own == spaces.Discrete(2)
 
 
-def test_numbers_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The client forgets spaces before they are many; with a higher bound it keeps all of them."""
+@pytest.mark.parametrize(
+    "large",
+    [
+        lambda: spaces.Box(0, 1, (1 << 17,), np.float32),  # its bounds
+        lambda: spaces.Text(1, charset="".join(map(chr, range(1 << 13)))),  # a set, a list, a dict
+        lambda: spaces.Dict({"k" * (3 << 17): spaces.Discrete(2)}),
+        lambda: spaces.Dict({tuple(range(1 << 14)): spaces.Discrete(2)}),
+    ],
+    ids=["bounds", "characters", "key", "tuple"],
+)
+def test_numbers_fill_no_memory(
+    large: Callable[[], gym.Space[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The client forgets large spaces before they are many; with a higher bound it keeps all."""
 
     def kept() -> int:
         copies, sent = SpaceCopies(), []
-        for number in range(100):
-            space = spaces.Box(0, 1, (1 << 17,), np.float32)  # its bounds take 1 MiB
+        for number in range(200):
+            space = large()
             vars(space)[NUMBER] = number, []
             sent.append(weakref.ref(copies.of(space)))
         del space
         return sum(each() is not None for each in sent)
 
-    assert 1 <= kept() <= space_copies.MAX_BYTES >> 20
+    assert 1 <= kept() <= 2 * space_copies.MAX_BYTES >> 20
     monkeypatch.setattr(space_copies, "MAX_BYTES", 1 << 40)
-    assert kept() == 100, "the control failed: it keeps what it may"
+    assert kept() == 200, "the control failed: it keeps what it may"
