@@ -33,10 +33,12 @@ _KEPT = ("GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM", "GIT_CONFIG_NOSYSTEM")
 _LIST = ("ls-files", "-z", "-v", "--cached", "--others", "--exclude-standard")
 _CONVERSIONS = ("filter", "ident", "working-tree-encoding")
 """Attributes that make a folder's bytes differ from the commit's, apart from line ends."""
-_SHA256 = r"(?im)^\s*objectformat\s*=\s*\"?sha256"
+_KEY = r"(?im)(?:^|\])[ \t]*{}[ \t]*=[ \t]*\"?"
+"""Where a line of git's configuration sets a key; no blank line is read twice."""
+_SHA256 = _KEY.format("objectformat") + "sha256"
 """Marks SHA-256 ids in git's configuration; git would misread such an index without an error."""
 
-_MODELESS = r"(?im)^\s*filemode\s*=\s*\"?(false|no|off|0)\b"
+_MODELESS = _KEY.format("filemode") + r"(false|no|off|0)\b"
 """Marks a checkout, as of Windows, whose index says which files are executable."""
 
 

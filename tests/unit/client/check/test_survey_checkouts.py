@@ -46,16 +46,21 @@ def test_an_honest_checkout_has_no_findings(repository: GitRepository) -> None:
     assert found(repository.folder) == []
 
 
-@pytest.mark.parametrize("why", ["not installed", "fails", "SHA-256", "no checkout"])
+@pytest.mark.parametrize(
+    "why", ["not installed", "fails", "SHA-256", "SHA-256, late", "no checkout"]
+)
 def test_where_git_says_nothing_that_is_found(
     why: str, repository: GitRepository, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As nobody knows what its commit has; a folder in no checkout, the last, is the control."""
     if why == "fails":
         (repository.folder / ".git/index").write_text("none")
-    elif why == "SHA-256":
+    elif why.startswith("SHA-256"):
+        text = "[extensions]\nobjectFormat = sha256\n"
+        if why.endswith("late"):
+            text = "\n" * 60_000 + text.replace("\n", " ")
         with (repository.folder / ".git/config").open("a") as config:
-            config.write("[extensions]\nobjectFormat = sha256\n")
+            config.write(text)
     else:
         monkeypatch.setenv("PATH", "")
     if why == "no checkout":
