@@ -38,7 +38,7 @@ def examine_server(server: RemoteSandbox, profile: str, *, json: bool) -> Exit:
 def _verdict(facts: ServerFacts, profile: str) -> tuple[Exit, str | None]:
     if facts.draining:
         return Exit.WORKER, "it drains: it accepts nothing new"
-    if not facts.detailed or facts.enforces(profile):
+    if facts.enforces(profile):
         return Exit.OK, None
     return Exit.SANDBOX, (
         f"no jail with the profile {profile!r} there: {facts.profile!r} is the strongest that it "
@@ -52,13 +52,10 @@ def print_facts(server: RemoteSandbox, facts: ServerFacts, problem: str | None) 
     out(f"{safe_line(server.endpoint)}: {release}", "bold")
     let_in = "asks for no key" if server.insecure_loopback else "knows our key"
     show("answered", f"after {facts.answered_s:.2f} s; it {let_in}")
-    if facts.detailed:
-        granted = {"network": facts.network, "gpu": facts.gpu, "dependencies": facts.dependencies}
-        show("python", facts.python)
-        show("profiles", f"{facts.profile} at most; policies may ask for {facts.weakest_profile}")
-        show("permits", ", ".join(name for name, is_on in granted.items() if is_on) or "no more")
-    else:
-        out("It is older than this client, and does not say what it can enforce.")
+    granted = {"network": facts.network, "gpu": facts.gpu, "dependencies": facts.dependencies}
+    show("python", facts.python)
+    show("profiles", f"{facts.profile} at most; policies may ask for {facts.weakest_profile}")
+    show("permits", ", ".join(name for name, is_on in granted.items() if is_on) or "no more")
     if facts.quotas:
         out()
         show_rows([("quota", "used", "limit"), *_quotas(facts)], right=(1, 2))

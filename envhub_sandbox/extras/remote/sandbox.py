@@ -293,7 +293,6 @@ class ServerFacts:
     Attributes:
         protocol: The agreed version of the protocol.
         answered_s: Seconds from the start of the connection to the server's welcome.
-        detailed: Whether the server reports more than this; older servers do not.
         profile: The strongest profile of a jail there.
         weakest_profile: The weakest profile that a policy may ask for.
         network: Whether a policy may ask for the server's network.
@@ -309,14 +308,13 @@ class ServerFacts:
     answered_s: float
     quotas: dict[str, int]
     used: dict[str, int]
-    detailed: bool = False
-    python: str = ""
-    profile: str = ""
-    weakest_profile: str = ""
-    network: bool = False
-    gpu: bool = False
-    dependencies: bool = False
-    draining: bool = False
+    python: str
+    profile: str
+    weakest_profile: str
+    network: bool
+    gpu: bool
+    dependencies: bool
+    draining: bool
 
     def enforces(self, profile: str) -> bool:
         """Whether the server can enforce a profile, and its operator permits it."""
@@ -360,7 +358,6 @@ def facts_of(welcome: m.Welcome, answered_s: float, said: dict[Any, Any]) -> Ser
         version=_text(welcome.worker),
         protocol=welcome.version,
         answered_s=answered_s,
-        detailed=bool(said),
         **words,
         network=said.get("network") is True,
         gpu=said.get("gpu") is True,

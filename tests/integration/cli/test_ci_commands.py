@@ -172,7 +172,6 @@ def test_a_server_on_another_host_is_obeyed_no_more(capsys: pytest.CaptureFixtur
         **{
             **dict.fromkeys(ServerFacts.__dataclass_fields__, _LONG),
             "answered_s": 0.1,
-            "detailed": True,
             "quotas": {_LONG: 3},
             "used": {},
         }

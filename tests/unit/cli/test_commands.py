@@ -278,9 +278,9 @@ def test_the_code_is_the_verdict(
     assert document["server"]["quotas"] == SAID["quotas"]
 
 
-def test_a_silent_server_is_older(looks: Examine, capsys: pytest.CaptureFixture[str]) -> None:
-    assert looks({}) is Exit.OK
-    assert "older than this client" in capsys.readouterr().out
+def test_the_names_of_quotas_paint_nothing(
+    looks: Examine, capsys: pytest.CaptureFixture[str]
+) -> None:
     looks(SAID | {"quotas": {"a\n\x1b[2J[red]b_bytes": 1}})
     text = capsys.readouterr().out
     assert "\x1b" not in text

@@ -310,7 +310,7 @@ ANSWER: dict[Any, Any] = {
 def test_what_it_says_is_kept() -> None:
     """What it may enforce lies between its strongest profile and the weakest that it permits."""
     found = facts_of(m.Welcome(1, "0.1.0", 7), 0.5, ANSWER)
-    assert (found.detailed, found.network, found.gpu, found.draining) == (True, True, False, False)
+    assert (found.network, found.gpu, found.draining) == (True, False, False)
     assert (found.quotas, found.used) == ({"jails": 4}, {"jails": 1})
     known = [one for one in ("strict", "no-userns", "container", "lax") if found.enforces(one)]
     assert known == ["strict", "no-userns"]
