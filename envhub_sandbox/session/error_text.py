@@ -57,7 +57,7 @@ def _place(frame: re.Match[str], snapshot: Snapshot) -> str | None:
 
 
 def _name(frame: re.Match[str], snapshot: Snapshot) -> str:
-    """The path of a frame's file in the repository; older workers send the absolute path."""
+    """The path of a frame's file in the repository; absolute in the text of another process."""
     return frame["file"].removeprefix(f"{snapshot.root}/")
 
 

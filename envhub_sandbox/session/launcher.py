@@ -429,8 +429,8 @@ class Launcher:
         The question restarts the time after which an idle jail ends.
         """
         try:
-            look = m.ReadOutput(loaded.jail.number, "make_env")
-            return isinstance(self._ask(loaded.server, look, Deadline(_CLOSE_S)), m.Output)
+            check = m.CheckJail(loaded.jail.number, "make_env")
+            return isinstance(self._ask(loaded.server, check, Deadline(_CLOSE_S)), m.Done)
         except EnvHubError:
             return None
 

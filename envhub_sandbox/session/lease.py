@@ -145,7 +145,7 @@ class Lease:
     def look(self, operation: str, deadline: Deadline) -> None:
         """Ask the server whether the jail lives. Raises ``WorkerDiedError``: it does not."""
         if self.loaded is not None:
-            self.loaded.jail.output(operation, deadline)
+            self.loaded.jail.check(operation, deadline)
 
     def watched(self, name: str) -> AttributeAnswer | None:
         """The known values of a watched attribute; None if unknown or if the state is not READY."""
@@ -350,7 +350,7 @@ class Lease:
 
 
 def _is_full(error: EnvHubError) -> bool:
-    """Whether the server has no room. Older servers say that by a plain ``WorkerError``."""
+    """Whether the server has no room; a limit that is no quota is a plain ``WorkerError``."""
     return isinstance(error, ServerBusyError) or type(error) is WorkerError
 
 

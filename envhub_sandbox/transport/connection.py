@@ -144,7 +144,8 @@ class WorkerConnection:
         """Agree on a protocol version."""
         self._compression = ""
         session = SESSION if self._far is None else remote_session_id()
-        greeting = m.Hello(m.VERSION, session)
+        offered = () if self._link is None else compression.available()
+        greeting = m.Hello(m.VERSION, session, offered)
         reply, _ = self.request(greeting, deadline=deadline)
         welcome = expect_reply(reply, m.Welcome)
         if welcome.version != m.VERSION:
@@ -152,12 +153,9 @@ class WorkerConnection:
                 f"this client speaks protocol {m.VERSION}, the worker {welcome.version}: install "
                 "the same release of envhub-sandbox on both sides"
             )
-        if self._link is not None:
-            reply, _ = self.request(m.Agree(compression.available()), deadline=deadline)
-            agreed = expect_reply(reply, m.Agreement)
-            if agreed.compression not in ("", *compression.available()):
-                raise RemoteProtocolError("the worker chose a compression that was not offered")
-            self._compression, self.patience_s = agreed.compression, agreed.idle_s
+        if welcome.compression not in ("", *offered):
+            raise RemoteProtocolError("the worker chose a compression that was not offered")
+        self._compression, self.patience_s = welcome.compression, welcome.idle_s
         return welcome
 
     def request(

@@ -198,22 +198,22 @@ class JailHandle:
         reply, payload = self.client.receive(request_id, deadline)
         count = self._asked.pop(request_id, None)
         with UNTRUSTED:
-            if type(reply) is not m.RelayDone and not (
-                self.kept and isinstance(reply, m.RelayDonePartly)
-            ):
+            if type(reply) is not m.RelayDone:
                 reply = expect_reply(reply, m.RelayDone)
+            if reply.dead and not self.kept:
+                raise RemoteProtocolError("the worker names dead runners of a jail that ends")
             parts = _cut(payload, reply.parts)
             if len(parts) != count:
                 raise RemoteProtocolError(f"{count} runners were asked, {len(parts)} answered")
             unpack = unpack or self._unpack
-            if isinstance(reply, m.RelayDonePartly):
+            if reply.dead:
                 raise self._died(reply.dead, parts, unpack)
             return [unpack(index, part) for index, part in enumerate(parts)]
 
     def arrived(self, request_id: int) -> list[Frames]:
         """Each runner's frames, if they have arrived, without removing them; empty for an error."""
         reply, payload = self.client.peek(request_id)
-        if type(reply) is not m.RelayDone:
+        if type(reply) is not m.RelayDone or reply.dead:
             return []
         try:
             with UNTRUSTED:
@@ -229,7 +229,7 @@ class JailHandle:
 
     def _died(self, dead: Sequence[int], parts: list[Frames], unpack: Unpack) -> RunnersDiedError:
         """The error for deaths of runners, which only the server can report."""
-        if not dead or not set(dead) <= set(range(len(parts))):
+        if not set(dead) <= set(range(len(parts))):
             raise RemoteProtocolError("the worker names dead runners that were not asked")
         messages = {index: self._unpack(index, parts[index]) for index in dead}
         deaths = {
@@ -272,19 +272,19 @@ class JailHandle:
         except RunnersDiedError as error:
             raise error.first from None
 
-    def output(self, operation: str, deadline: Deadline) -> str:
-        """The last lines that the jail printed.
-        Raises ``WorkerDiedError``: the jail has ended during ``operation``.
+    def check(self, operation: str, deadline: Deadline) -> None:
+        """Ask whether the jail lives.
+        Raises ``WorkerDiedError``: it has ended during ``operation``.
         """
-        reply, _ = self.client.request(m.ReadOutput(self.number, operation), deadline=deadline)
-        return expect_reply(reply, m.Output).text
+        reply, _ = self.client.request(m.CheckJail(self.number, operation), deadline=deadline)
+        expect_reply(reply, m.Done)
 
     def cause_of_death(self, operation: str) -> Exception:
         """Ask the server why the jail has ended, until it has reaped it; returns the error."""
         deadline = Deadline(_CAUSE_S)
         while not deadline.passed:
             try:
-                self.output(operation, deadline)
+                self.check(operation, deadline)
             except EnvHubError as error:
                 return error
             time.sleep(_CAUSE_POLL_S)

@@ -336,7 +336,7 @@ def relay(dice: Dice) -> None:
     counts = tuple(map(len, runner_replies))
     died = m.Death(1, "exit", 3, None, "", "", "step")
     answers: list[m.Message] = [
-        m.RelayDone(counts), m.RelayDonePartly(counts, (0,)), died,
+        m.RelayDone(counts), m.RelayDone(counts, (0,)), died,
         m.Refusal("SandboxUnavailableError", "x", "y", "z"),
         m.JailOpened(1, tuple(range(runners)), ()),
     ]  # fmt: skip
@@ -401,7 +401,7 @@ def server(dice: Dice) -> None:
     message = spoiled_message(dice, rng.choice(dice.messages))
     if isinstance(message, m.Death):
         usable(str(death(message)))
-    wanted = rng.choice((m.Done, m.RelayDone, m.JailOpened, m.Output, m.Welcome))
+    wanted = rng.choice((m.Done, m.RelayDone, m.JailOpened, m.Welcome))
     usable(str(attempt(lambda: expect_reply(message, wanted))))
     check_reply(message)
 

@@ -56,7 +56,7 @@ def test_another_clients_jail_is_not_there(alice: Any, mallory: Peer) -> None:
     jail = inside.jail(alice)
     for request in (
         m.StartRunners(jail.number, 1),
-        m.ReadOutput(jail.number, ""),
+        m.CheckJail(jail.number, ""),
         m.KeepJail(jail.number),
         m.ShareSlabs(jail.number, ()),
         m.ExpireIdle(jail.number, 1),
@@ -66,7 +66,7 @@ def test_another_clients_jail_is_not_there(alice: Any, mallory: Peer) -> None:
         payload = (b"x",) if isinstance(request, m.Relay) else ()
         assert "there is no jail" in mallory.refused(request, *payload).message
     assert isinstance(mallory.ask(m.CloseJail(jail.number)), m.Done)
-    assert jail.output("", Deadline(60)) is not None
+    jail.check("", Deadline(60))
     status = mallory.ask(m.GetStatus())
     assert status.jails == ()
 

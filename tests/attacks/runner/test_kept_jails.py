@@ -116,7 +116,7 @@ def lie(self, received):
     if MODE == "died":
         return m.pack(m.Death(1, "signal", None, "SIGKILL", "", "", "step"))
     if MODE == "partly":
-        return m.pack(m.RelayDonePartly((1, 1), (0,)))
+        return m.pack(m.RelayDone((1, 1), (0,)))
     if MODE == "twice":
         os.write(stream(), packet(number, forged()) + packet(number + 1, forged()))
         time.sleep(600)

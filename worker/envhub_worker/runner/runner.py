@@ -159,7 +159,7 @@ class Runner:
             # The caller's own arguments may be pickled. Only this line unpickles.
             return m.unpack(frames, unpickler=cloudpickle.loads)
         except Exception as error:  # of a class that is not to be had here, for instance
-            return raised(error, "arguments")
+            return raised(error, "arguments", self._snapshot)
 
     def _reply_to(
         self, request: m.Message, written: Callable[[m.Message], bool] | None = None

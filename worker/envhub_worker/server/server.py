@@ -190,9 +190,6 @@ class Server:
         if isinstance(request, m.Relay):
             self._jails.relay(asker, request, payload)
             return None
-        if isinstance(request, m.Agree):
-            self._agree(asker, request)
-            return None
         if handler := _HANDLERS.get(type(request)):
             return handler(self._jails, asker, request)
         if special := self._gate.handlers.get(type(request)):
@@ -203,7 +200,9 @@ class Server:
         """Answer a request."""
         self._gate.answered(asker, message)
         header, *buffers = (
-            _packed_done(message.parts) if type(message) is m.RelayDone else m.pack(message)
+            _packed_done(message.parts, message.dead)
+            if type(message) is m.RelayDone
+            else m.pack(message)
         )
         frames = [m.with_id(header, asker.request_id), *buffers, *payload]
         if agreed := self._compression(asker.identity, asker.key):
@@ -224,20 +223,15 @@ class Server:
         if not request.session:
             raise RefusedError("LocalProtocolError", "Hello has no name of a session")
         self._gate.greet(arrived, request.session)
-        return m.Welcome(m.VERSION, __version__, os.getpid())
-
-    def _agree(self, asker: Asker, request: m.Agree) -> None:
-        """Agree on a compression for later messages."""
-        # In this order: the reply goes out first, for it is not compressed yet.
         possible = compression.available() if self._gate.compresses else ()
-        chosen = next((name for name in request.compressions if name in possible), "")
-        self.reply(asker, m.Agreement(str(chosen), self._gate.idle_s))
-        self._sessions.agree(asker.identity, asker.key, str(chosen))
+        chosen = next((str(name) for name in request.compressions if name in possible), "")
+        self._sessions.agree(arrived.identity, arrived.key, chosen)
+        return m.Welcome(m.VERSION, __version__, os.getpid(), chosen, self._gate.idle_s)
 
 
 @lru_cache(maxsize=64)  # of small numbers, that the server has counted
-def _packed_done(parts: tuple[int, ...]) -> list[Buffer]:
-    return m.pack(m.RelayDone(parts))
+def _packed_done(parts: tuple[int, ...], dead: tuple[int, ...]) -> list[Buffer]:
+    return m.pack(m.RelayDone(parts, dead))
 
 
 _HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], m.Message | None]] = {
@@ -247,7 +241,7 @@ _HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], m.Message | None]
     m.ShareSlabs: Jails.share,
     m.ExpireIdle: Jails.expire,
     m.CloseJail: Jails.close_jail,
-    m.ReadOutput: Jails.read_output,
+    m.CheckJail: Jails.check,
     m.FollowOutput: Jails.follow_output,
     m.GetStatus: Jails.status,
 }

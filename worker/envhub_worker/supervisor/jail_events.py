@@ -145,8 +145,7 @@ class JailEvents:
             payload = [frame for frames in replies for frame in frames]
             counts = tuple(map(len, replies))
             dead = tuple(sorted(pending.dead))
-            answer = m.RelayDonePartly(counts, dead) if dead else m.RelayDone(counts)
-            self._reply(pending.asker, answer, payload)
+            self._reply(pending.asker, m.RelayDone(counts, dead), payload)
 
     def _read_output(self, entry: JailRecord) -> None:
         entry.output.read()

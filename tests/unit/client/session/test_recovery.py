@@ -53,7 +53,7 @@ def sent(said: JailHandle) -> int:
 
 def test_deaths_come_with_the_answers_of_the_others() -> None:
     """Each in its place: what lived has answered, and of the dead one knows how."""
-    said = jail(m.RelayDonePartly((1, 1), (1,)), m.Value(7), DIED)
+    said = jail(m.RelayDone((1, 1), (1,)), m.Value(7), DIED)
     with pytest.raises(RunnersDiedError) as caught:
         said.receive(sent(said), Deadline(1))
     assert caught.value.replies == [m.Value(7), None]
@@ -66,7 +66,7 @@ def test_deaths_come_with_the_answers_of_the_others() -> None:
 
 def test_a_runners_word_is_no_death() -> None:
     """A ``Death`` in the place of a living runner is an answer, and an illegal one."""
-    said = jail(m.RelayDonePartly((1, 1), (1,)), DIED, DIED)
+    said = jail(m.RelayDone((1, 1), (1,)), DIED, DIED)
     with pytest.raises(RunnersDiedError) as caught:
         said.receive(sent(said), Deadline(1))
     assert list(caught.value.deaths) == [1]
@@ -77,21 +77,20 @@ def test_a_runners_word_is_no_death() -> None:
 @pytest.mark.parametrize(
     ("reply", "parts"),
     [
-        (m.RelayDonePartly((1, 1), ()), (m.Value(7), DIED)),
-        (m.RelayDonePartly((1, 1), (2,)), (m.Value(7), DIED)),
-        (m.RelayDonePartly((1, 1), (-1,)), (m.Value(7), DIED)),
-        (m.RelayDonePartly((1, 1), (0,)), (m.Value(7), DIED)),
-        (m.RelayDonePartly((1, 2), (1,)), (m.Value(7), DIED)),
-        (m.RelayDonePartly((2, 0), (1,)), (m.Value(7), DIED)),
+        (m.RelayDone((1, 1), (2,)), (m.Value(7), DIED)),
+        (m.RelayDone((1, 1), (-1,)), (m.Value(7), DIED)),
+        (m.RelayDone((1, 1), (0,)), (m.Value(7), DIED)),
+        (m.RelayDone((1, 2), (1,)), (m.Value(7), DIED)),
+        (m.RelayDone((2, 0), (1,)), (m.Value(7), DIED)),
     ],
 )
-def test_false_deaths_are_refused(reply: m.RelayDonePartly, parts: tuple[m.Message, ...]) -> None:
-    """Nobody dead, nobody asked, no ``Death``, frames too many or too few."""
+def test_false_deaths_are_refused(reply: m.RelayDone, parts: tuple[m.Message, ...]) -> None:
+    """Nobody asked, no ``Death``, frames too many or too few."""
     said = jail(reply, *parts)
     with pytest.raises(RemoteProtocolError):
         said.receive(sent(said), Deadline(1))
-    said = jail(m.RelayDonePartly((1, 1), (1,)), m.Value(7), DIED, kept=False)
-    with pytest.raises(RemoteProtocolError, match="RelayDonePartly"):  # it was not asked for
+    said = jail(m.RelayDone((1, 1), (1,)), m.Value(7), DIED, kept=False)
+    with pytest.raises(RemoteProtocolError, match="dead runners"):  # it was not asked for
         said.receive(sent(said), Deadline(1))
 
 

@@ -79,8 +79,8 @@ def test_a_reply_is_there_once_it_has_arrived() -> None:
         return []
 
     with connected() as (server, connection):
-        server.lies[m.ReadOutput] = hold
-        first = connection.send(m.ReadOutput(1, ""))
+        server.lies[m.CheckJail] = hold
+        first = connection.send(m.CheckJail(1, ""))
         assert eventually(lambda: bool(held))
         assert not connection.arrived(first)
         server.lies[m.GetStatus] = lambda asked: [*held, asked.answer(asked.honest)]
@@ -88,9 +88,9 @@ def test_a_reply_is_there_once_it_has_arrived() -> None:
         assert eventually(lambda: connection.arrived(first))
         assert connection.arrived(first)
         for _ in range(2):
-            assert connection.peek(first) == (m.Output(""), [])
+            assert connection.peek(first) == (m.Done(), [])
         assert connection.peek(second) == (None, [])
-        assert connection.receive(first, Deadline(0))[0] == m.Output("")
+        assert connection.receive(first, Deadline(0))[0] == m.Done()
         assert connection.peek(first) == (None, [])
         assert eventually(lambda: connection.arrived(second))
         assert connection.receive(second, Deadline(0))[0] == m.Status(())
@@ -103,12 +103,12 @@ def test_a_reply_is_there_once_it_has_arrived() -> None:
 def test_a_frame_over_the_limit_does_not_arrive() -> None:
     """It is refused by its length, before libzmq takes memory for it."""
     with lying() as server:
-        server.lies[m.ReadOutput] = lambda asked: [asked.answer(m.Output("x" * 20_000))]
+        server.lies[m.CheckJail] = lambda asked: [asked.answer(m.Status(("x" * 20_000,)))]
         limits = WireLimits(frame_bytes=10_000)
         connection = WorkerConnection(server.endpoint, server.process_fd, limits)
         try:
             with pytest.raises(WorkerTimeoutError):
-                connection.request(m.ReadOutput(1, ""), deadline=Deadline(1))
+                connection.request(m.CheckJail(1, ""), deadline=Deadline(1))
         finally:
             connection.close()
 
@@ -119,12 +119,12 @@ def test_other_replies_are_dropped_while_one_is_looked_for() -> None:
     dropped = [0]
 
     def flood(asked: Asked) -> list[Frames]:
-        stale = [asked.answer(m.Output("stale"), asked.request_id + 1000 + i) for i in range(50)]
+        stale = [asked.answer(m.Done(), asked.request_id + 1000 + i) for i in range(50)]
         return [*stale, asked.answer(asked.honest)]
 
     with connected() as (server, connection):
-        server.lies[m.ReadOutput] = flood
-        sent = connection.send(m.ReadOutput(1, ""))
+        server.lies[m.CheckJail] = flood
+        sent = connection.send(m.CheckJail(1, ""))
 
         def look() -> bool:
             there = connection.arrived(sent)
@@ -134,13 +134,13 @@ def test_other_replies_are_dropped_while_one_is_looked_for() -> None:
         assert eventually(look)
         assert dropped[-1] == 50
         assert max(later - before for before, later in pairwise(dropped)) == 1
-        assert connection.receive(sent, Deadline(0))[0] == m.Output("")
+        assert connection.receive(sent, Deadline(0))[0] == m.Done()
 
 
 def test_what_is_no_reply_is_raised_where_it_is_received() -> None:
     with connected() as (server, connection):
-        server.lies[m.ReadOutput] = lambda asked: [[b"noise"]]
-        sent = connection.send(m.ReadOutput(1, ""))
+        server.lies[m.CheckJail] = lambda asked: [[b"noise"]]
+        sent = connection.send(m.CheckJail(1, ""))
         assert eventually(lambda: connection.arrived(sent))
         assert connection.peek(sent) == (None, [])
         with pytest.raises(RemoteProtocolError):
@@ -167,9 +167,9 @@ def test_an_interrupt_in_a_look_is_noted(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_the_end_of_a_server_has_arrived_as_well() -> None:
     with process("sleep 1000") as (child, pidfd), lying() as server:
-        server.lies[m.ReadOutput] = lambda asked: []
+        server.lies[m.CheckJail] = lambda asked: []
         connection = WorkerConnection(server.endpoint, pidfd)
-        sent = connection.send(m.ReadOutput(1, ""))
+        sent = connection.send(m.CheckJail(1, ""))
         assert not connection.arrived(sent)
         child.kill()
         assert eventually(lambda: connection.arrived(sent))
@@ -183,10 +183,10 @@ def test_the_log_names_each_message(caplog: pytest.LogCaptureFixture) -> None:
     with lying() as server:
         client = WorkerConnection(server.endpoint, server.process_fd)
         client.request(m.Hello(m.VERSION, b"a secret"), deadline=Deadline(60))
-        client.request(m.ReadOutput(1, "step"), deadline=Deadline(60))
+        client.request(m.CheckJail(1, "step"), deadline=Deadline(60))
         with pytest.raises(WorkerTimeoutError):
             client.receive(99, Deadline(0))
         client.close()
     assert [line.strip() for line in caplog.messages] == [
-        *("> 1 Hello", "< 1 Welcome", "> 2 ReadOutput step", "< 2 Output")
+        *("> 1 Hello", "< 1 Welcome", "> 2 CheckJail step", "< 2 Done")
     ]

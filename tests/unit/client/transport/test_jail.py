@@ -48,7 +48,7 @@ def test_what_has_arrived_is_shown_and_stays() -> None:
         m.RelayDone((1, 1)),
         m.RelayDone((4, -1)),
         m.RelayDone((1, 1, 1)),
-        m.RelayDonePartly((1, 2), (0,)),
+        m.RelayDone((1, 2), (0,)),
         m.Death(1, "exit", 1),
         m.Done(),
     ]

@@ -242,7 +242,7 @@ def test_other_replies_than_expected_break_the_rules() -> None:
     check_reply(m.Value(3))
     assert expect_reply(m.Done(), m.Done) == m.Done()
     for reply, kind, said in (
-        (m.Output(""), errors.RemoteProtocolError, "with Output instead of Done"),
+        (m.GetStatus(), errors.RemoteProtocolError, "with GetStatus instead of Done"),
         (SERVERS[0], errors.WorkerDiedError, "died"),
         (m.Refusal("WorkerError", "no", "", ""), errors.WorkerError, "no"),
     ):

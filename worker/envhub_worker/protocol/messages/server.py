@@ -17,6 +17,8 @@ class Hello(Message, kind=1):
     version: int
     session: bytes
     """Random bytes that join the connections of one client; jails belong to a session."""
+    compressions: tuple[object, ...] = ()
+    """Those that the client can read, best first."""
 
 
 class Welcome(Message, kind=2):
@@ -25,6 +27,10 @@ class Welcome(Message, kind=2):
     version: int
     worker: str
     pid: int
+    compression: str = ""
+    """The compression of all later messages, or ``""``."""
+    idle_s: int = 0
+    """The server ends the jails of a client that is silent for so many seconds; 0 means never."""
 
 
 BUSY_ERROR = "ServerBusyError"
@@ -145,9 +151,15 @@ class Relay(Message, kind=7):
 
 
 class RelayDone(Message, kind=8):
-    """The runners' replies: ``parts`` is the number of frames of each, in the request's order."""
+    """The runners' replies: ``parts`` is the number of frames of each, in the request's order.
+
+    In a kept jail (``KeepJail``), ``dead`` holds the indices of runners that have died; the part at
+    each is the server's own ``Death``, in one frame. A runner cannot forge one: a part outside
+    ``dead`` never counts as a death.
+    """
 
     parts: tuple[int, ...]
+    dead: tuple[int, ...] = ()
 
 
 class Death(Message, kind=9):
@@ -175,20 +187,11 @@ class Done(Message, kind=11):
     """The request is done and has no result."""
 
 
-class ReadOutput(Message, kind=12):
-    """Ask for the last lines that a jail printed. Reply: ``Output``, or ``Death``.
-
-    ``operation`` is the client's pending operation, which a ``Death`` then names.
-    """
+class CheckJail(Message, kind=12):
+    """Ask whether a jail lives. Reply: ``Done``, or ``Death``, which names the ``operation``."""
 
     jail: int
     operation: str
-
-
-class Output(Message, kind=13):
-    """The last lines of a jail's output, control characters escaped."""
-
-    text: str
 
 
 class GetStatus(Message, kind=14):
@@ -216,17 +219,6 @@ class KeepJail(Message, kind=17):
     """From now on a runner's death does not end the jail. Reply: ``Done``, or ``Death``."""
 
     jail: int
-
-
-class RelayDonePartly(Message, kind=18):
-    """Like ``RelayDone``, for a kept jail (``KeepJail``) in which some runners have died.
-
-    ``dead`` holds their indices in the request; the part at each is the server's own ``Death``, in
-    one frame. A runner cannot forge one: a part outside ``dead`` never counts as a death.
-    """
-
-    parts: tuple[int, ...]
-    dead: tuple[int, ...]
 
 
 class OfferSnapshot(Message, kind=19):
@@ -258,22 +250,6 @@ class KeepAlive(Message, kind=22):
     """The client lives, and still holds these jails. Reply: ``Done``."""
 
     jails: tuple[int, ...]
-
-
-class Agree(Message, kind=23):
-    """The compressions that the client can read, best first. Reply: ``Agreement``."""
-
-    compressions: tuple[object, ...]
-
-
-class Agreement(Message, kind=24):
-    """The compression of all later messages, or ``""``; and how long the server waits.
-
-    The server ends the jails of a client that is silent for ``idle_s`` seconds; 0 means never.
-    """
-
-    compression: str
-    idle_s: int
 
 
 class CompressionHeader(Message, kind=25):

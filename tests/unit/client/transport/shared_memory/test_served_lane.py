@@ -342,7 +342,7 @@ def test_who_dies_before_its_infos_came_has_died(ahead: bool) -> None:
     served.lane.jail.kept = True
     served.step()
     served.server.answer(slab(reward=1), slab(slabs.FETCH), slab(slabs.FETCH, reward=3))
-    died = m.RelayDonePartly((1, len(INFOS)), (0,)), m.pack(m.Death(2, "exit", 1)), INFOS
+    died = m.RelayDone((1, len(INFOS)), (0,)), m.pack(m.Death(2, "exit", 1)), INFOS
     if ahead:
         assert not served.lane.answered()
         served.server.reply(*died, to=served.server.ids[-1])
