@@ -291,9 +291,10 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         copied = self._copier()
         infos: Pairs = []
         index, answered, over, again = 0, -1, False, -1
-        each = zip(range(count), self._each(actions), self.driven, self._done, rows, strict=True)
+        each = self._each(actions)
         try:
-            for index, action, env, over, row in each:
+            for index, env in enumerate(self.driven):
+                action, over = next(each), self._done[index]  # past its end an array raises, slowly
                 if over:
                     if self.resets_nothing:  # those before it have been stepped, as in Gymnasium
                         raise AssertionError(f"self._autoreset_envs={np.array(self._done)!r}")
@@ -324,7 +325,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                     and observation.dtype is dtype
                     and observation.shape == shape
                 ):
-                    row[...] = observation
+                    rows[index][...] = observation
                 else:
                     store(index, observation)
                 if type(info) is not dict:
