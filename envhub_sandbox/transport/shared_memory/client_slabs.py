@@ -19,9 +19,8 @@ from __future__ import annotations
 import mmap
 import operator
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from time import perf_counter_ns
 from typing import TYPE_CHECKING, Any
 
@@ -538,37 +537,51 @@ class ObservationSlab(SlotRing):
         super().__init__(layout.slots, layout.slot_bytes, layout.total_bytes)
         self.layout = layout
         self._assemble = slabs.assembler(space)
-        self._copies = [_copier(self._slots[_SPARE], leaf) for leaf in layout.leaves]
-        flat = len(self._copies) == 1 and not layout.leaves[0].path
-        self._single = self._copies[0] if flat else None
+        self._views = [_view(self._slots[_SPARE], leaf) for leaf in layout.leaves]
+        self._flat = len(layout.leaves) == 1 and not layout.leaves[0].path  # one array
         self._rewards, self._flags = slabs.results(self._memory, layout)
+        self._leaves: list[Any] = []  # arrays for the next batch, and for its results
+        self._results: tuple[Any, ...] = ()
         self._unheld = [sys.getrefcount(self._slots[index]) for index in range(len(self._slots))]
+
+    def prepare(self) -> None:
+        """Make the arrays that the next batch is copied into."""
+        count = self.layout.count
+        if self.chosen == _SPARE:
+            self._leaves = [np.empty(leaf.shape, leaf.dtype) for leaf in self.layout.leaves]
+        flags = np.empty(2 * count, np.bool_)
+        self._results = flags, np.empty(count), flags[:count], flags[count:]
 
     def take(self) -> Any:
         """The batch in the chosen slot, in the structure of the space."""
-        if self.chosen == _SPARE:
-            if self._single is not None:
-                return self._single()
-            return self._assemble([copy() for copy in self._copies])
-        slot = self._slots[self.chosen]
-        return self._assemble([_borrowed(slot, leaf) for leaf in self.layout.leaves])
+        if self.chosen != _SPARE:
+            slot = self._slots[self.chosen]
+            return self._assemble([_borrowed(slot, leaf) for leaf in self.layout.leaves])
+        if not self._leaves:
+            self.prepare()
+        leaves, self._leaves = self._leaves, []
+        # cast, not viewed as bool: a hostile byte of 2 would be neither True nor False
+        if self._flat:
+            leaves[0][...] = self._views[0]
+            return leaves[0]
+        for leaf, view in zip(leaves, self._views, strict=True):
+            leaf[...] = view
+        return self._assemble(leaves)
 
     def results(self) -> tuple[Any, Any, Any]:
         """Copies of rewards (float64), terminations and truncations (bool), ``(num_envs,)``."""
-        # cast, not viewed as bool: a hostile byte of 2 would be neither True nor False
-        flags = self._flags.astype(np.bool_)
-        count = self.layout.count
-        return self._rewards.copy(), flags[:count], flags[count:]
+        if not self._results:
+            self.prepare()
+        (flags, rewards, over, cut), self._results = self._results, ()
+        flags[...] = self._flags  # cast, as above
+        rewards[...] = self._rewards
+        return rewards, over, cut
 
 
-def _copier(slot: Any, leaf: slabs.Leaf) -> Callable[[], Any]:
-    if leaf.dtype.kind == "b":
-        # cast, not viewed as bool: a hostile byte of 2 would be neither True nor False
-        return partial(slabs.view(slot, leaf, np.dtype(np.uint8)).astype, np.bool_)
-    return slabs.view(slot, leaf).copy
+def _view(slot: Any, leaf: slabs.Leaf) -> Any:
+    return slabs.view(slot, leaf, np.dtype(np.uint8) if leaf.dtype.kind == "b" else None)
 
 
 def _borrowed(slot: mmap.mmap, leaf: slabs.Leaf) -> Any:
-    if leaf.dtype.kind == "b":
-        return slabs.view(slot, leaf, np.dtype(np.uint8)).astype(np.bool_)
-    return slabs.view(slot, leaf)
+    view = _view(slot, leaf)
+    return view.astype(np.bool_) if leaf.dtype.kind == "b" else view

@@ -20,6 +20,7 @@ from envhub_sandbox.transport.shared_memory.client_slabs import (
     ObservationSlab,
     Outcome,
     SlotRing,
+    Wishes,
     action_layouts,
 )
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
@@ -50,6 +51,7 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
         )
         slots = [self.observations] * len(layouts)
         super().__init__(layouts[0], self.observations, relay, layouts, slots, attachment)
+        self._wishes: list[Wishes] = [(0, 0, 0)] * len(layouts)  # for the next step
         self._steps = 0  # so far, for ``traffic``
         self._step_bytes = sum(one.action_bytes for one in layouts), observed.batch_bytes
 
@@ -85,13 +87,25 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
         rows = self._rows(actions)
         self._asked_ns = perf_counter_ns()
         self._spin = self._step_spin
-        spin_ns = self._spin.budget_ns
         slot = self.observations.choose()
-        cpus = self._cores.of_shards(spin_ns > 0)
+        if slot != self._wishes[0][0]:
+            self._plan(slot)
         # each shard starts as soon as its actions are written, while the next are still written
-        for index, (shard, leaves, cpu) in enumerate(zip(self.shards, rows, cpus, strict=True)):
-            shard.write(leaves, (slot, spin_ns if index < self._awake else 0, cpu))
+        for index, leaves in enumerate(rows):
+            shard = self.shards[index]
+            shard.write(leaves, self._wishes[index])
             shard.announce()
+        # the shards compute meanwhile, so nobody waits for what follows
+        self._plan(slot)
+        self.observations.prepare()
+
+    def _plan(self, slot: int) -> None:
+        """Plan where the shards write a batch, and how they wait for the request after it."""
+        spin_ns = self._step_spin.budget_ns
+        cpus = self._cores.of_shards(spin_ns > 0)
+        self._wishes = [
+            (slot, spin_ns if index < self._awake else 0, cpu) for index, cpu in enumerate(cpus)
+        ]
 
     def _outcomes(self, deadline: Deadline) -> tuple[list[Outcome], dict[int, WorkerDiedError]]:
         deaths = self._wait_for_all(deadline)

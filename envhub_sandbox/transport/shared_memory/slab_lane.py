@@ -154,6 +154,8 @@ class ColumnSteps(SlabLane):
     def wait(self, deadline: Deadline) -> None:
         """Implements ``Lane.wait``."""
         self._said, deaths = self._outcomes(deadline)
+        if not (self._said or deaths or self._owed):
+            return  # as usual: results only
         kinds = [kind for kind, _ in self._said]
         # If a shard raised, the infos of others are not fetched, unless a recovery needs them, or
         # they were requested already: warnings come with them.
@@ -166,7 +168,8 @@ class ColumnSteps(SlabLane):
 
     def result(self) -> StepResult:
         """Implements ``Lane.result``. Trust: input from the worker."""
-        return self._batch.take(), *self._batch.results(), self._infos() if self._said else {}
+        observation, (rewards, over, cut) = self._batch.take(), self._batch.results()
+        return observation, rewards, over, cut, self._infos() if self._said else {}
 
     def _infos(self) -> dict[Any, Any]:
         columns = all(kind == slabs.COLUMNS for kind, _ in self._said)

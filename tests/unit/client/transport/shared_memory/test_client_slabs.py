@@ -51,12 +51,17 @@ def write(slab: ObservationSlab, value: int) -> None:
         slabs.view(memory, leaf, base=base)[...] = value
 
 
-def test_one_slot_is_copied_out(slab_of: Callable[..., ObservationSlab]) -> None:
+@pytest.mark.parametrize("prepared", [False, True])
+def test_one_slot_is_copied_out(slab_of: Callable[..., ObservationSlab], prepared: bool) -> None:
     slab = slab_of(NESTED)
     assert slab.choose() == 0
+    if prepared:
+        slab.prepare()
     write(slab, 1)
     first = slab.take()
     write(slab, 0)
+    assert not slab.take()["seen"].any()
+    assert not np.shares_memory(slab.results()[0], slab.results()[0])
     assert first["seen"].tolist() == [[1] * 4] * COUNT
     assert [leaf.shape for leaf in first["both"]] == [(COUNT, 3), (COUNT,)]
     assert [leaf.tolist() for leaf in first["both"]] == [[[1.0] * 3] * COUNT, [1] * COUNT]
