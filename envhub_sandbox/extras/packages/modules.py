@@ -1,7 +1,7 @@
 """Finds the modules that a repository imports, the package of each, and advice for missing ones.
 
-The repository's pyproject.toml or our table, ``extras/sources/modules.txt``, names the package of a
-module; never an index: anybody may publish a package under a module's name.
+The repository's pyproject.toml or our table, ``modules.txt``, names the package of a module; never
+an index: anybody may publish a package under a module's name.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import re
 import sys
 import sysconfig
 from collections.abc import Collection, Mapping, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -103,15 +103,18 @@ def guessed(snapshot: Snapshot) -> tuple[Guess, ...]:
 
 @lru_cache(maxsize=64)
 def _guessed(root: Path, rows: tuple[tuple[str, str, int], ...]) -> tuple[Guess, ...]:
-    if not rows:
-        return ()
-    from envhub_sandbox.extras.packages.declared import optional, parse_requirement
+    extras: dict[str, WantedPackage] = {}
+    if rows and (root / "pyproject.toml").is_file():
+        from envhub_sandbox.extras.packages.declared import optional
 
-    extras = optional(root)
+        extras = optional(root)
     guesses: dict[str, Guess] = {}
     for name, file, line in rows:
         guess = _of_id(name) if "-" in name else _of_module(name, extras)
         if guess is not None and len(guesses) < _MOST:
+            # late: packaging takes half of the time of a make_env whose manifest is known
+            from envhub_sandbox.extras.packages.declared import parse_requirement
+
             module, requirement, brought_by = guess
             wanted = parse_requirement(
                 requirement,
@@ -129,14 +132,10 @@ def _of_id(text: str) -> tuple[str, str, list[str]] | None:
 
 
 def _of_module(name: str, extras: Mapping[str, WantedPackage]) -> tuple[str, str, list[str]] | None:
-    from packaging.utils import canonicalize_name
-
-    from envhub_sandbox.extras.sources.parsing import of_module
-
-    distributions = of_module(name)
+    distributions = _distributions(name)
     # of its own name, too: pygame-ce is the usual one for pygame, and who declares pygame has it
     every = [*distributions, name.partition(".")[0]]
-    names = list(map(str, map(canonicalize_name, every)))
+    names = [re.sub(r"[-_.]+", "-", distribution).lower() for distribution in every]
     own = next(
         (str(extras[distribution].requirement) for distribution in names if distribution in extras),
         None,
@@ -144,6 +143,24 @@ def _of_module(name: str, extras: Mapping[str, WantedPackage]) -> tuple[str, str
     if own is None and not distributions:
         return None
     return name.partition(".")[0], own or distributions[0], names
+
+
+def _distributions(module: str) -> list[str]:
+    """Returns the distributions that bring a module, the usual first; empty if none is known."""
+    table = _table()
+    while module and module not in table:
+        module = module.rpartition(".")[0]
+    return table.get(module, [])
+
+
+@cache
+def _table() -> dict[str, list[str]]:
+    text = Path(__file__).with_name("modules.txt").read_text("utf-8")
+    rows = [line.split() for line in text.splitlines() if not line.startswith("#")]
+    own = {module: [module] for sign, *names in rows if sign == "=" for module in names}
+    return own | {
+        module: [] if names == ["-"] else names for module, *names in rows if module != "="
+    }
 
 
 def is_here(guess: Guess) -> bool:
@@ -200,13 +217,11 @@ def note_missing(snapshot: Snapshot, said: str) -> bool:
 
     Trust: text from the worker. It selects a module of our table, as an entry file can too.
     """
-    from envhub_sandbox.extras.sources.parsing import of_module
-
     module = match[1][:_LONGEST] if (match := re.search(_MISSING, said)) else ""
     imports = read(snapshot)
     names = _WORKERS.union(name.partition(".")[0] for name, _, _ in imports)
     noted = sum(line == 0 for _, _, line in imports)
-    if not of_module(module) or module.partition(".")[0] in names or noted >= _MOST_NOTED:
+    if not _distributions(module) or module.partition(".")[0] in names or noted >= _MOST_NOTED:
         return False
     rows = *imports, (module, f"a package of it, which imports {module}", 0)
     _READ[snapshot.root, snapshot.path] = rows
@@ -271,14 +286,12 @@ class MissingModule:
         return ""
 
     def _cure(self, module: str, says: DeclaredPackages | None) -> str:
-        from envhub_sandbox.extras.sources.parsing import has_row, of_module
-
-        names = of_module(module)
+        names = _distributions(module)
         top = module.partition(".")[0]
         if python := _REMOVED.get(top):
             older = option_name("dependencies", {"python": python, "fetch_python": True})
             return f"Python {python} is the last that has {module}; {older} takes it"
-        if "." in module and not has_row(module):
+        if "." in module and module not in _table():
             return f"{top} is there, and has no {module}: only another release of it may have it"
         path = _path_here(top, sys.path) if top else ""
         if path and not names:  # an index may have another package of that name

@@ -18,7 +18,6 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -287,26 +286,3 @@ def candidates(name: str, folder: str) -> Iterator[str]:
     for below in dict.fromkeys((folder, "", "src")):
         base = f"{below}/{path}".strip("/")
         yield from (f"{base}.py", f"{base}/__init__.py")
-
-
-def of_module(name: str) -> list[str]:
-    """Returns the distributions that bring a module, the usual first; empty if none is known."""
-    table = _table()
-    while name and name not in table:
-        name = name.rpartition(".")[0]
-    return table.get(name, [])
-
-
-def has_row(name: str) -> bool:
-    """Tells whether the table of modules has a row of its own for a module."""
-    return name in _table()
-
-
-@cache
-def _table() -> dict[str, list[str]]:
-    text = Path(__file__).with_name("modules.txt").read_text("utf-8")
-    rows = [line.split() for line in text.splitlines() if not line.startswith("#")]
-    own = {module: [module] for sign, *names in rows if sign == "=" for module in names}
-    return own | {
-        module: [] if names == ["-"] else names for module, *names in rows if module != "="
-    }

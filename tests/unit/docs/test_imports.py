@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -377,12 +378,18 @@ def test_the_protocol_loads_neither_zeromq_nor_the_hub() -> None:
     assert not loaded & {"zmq", "huggingface_hub", "envhub_sandbox", "torch", "psutil"}
 
 
-def test_what_speaks_with_a_server_is_imported_while_that_starts(snapshot_store: Path) -> None:
-    """It costs nothing then. A known manifest, ``make_env`` and the start need none of it."""
+@pytest.mark.usefixtures("snapshot_store")
+def test_what_speaks_with_a_server_is_imported_while_that_starts(tmp_path: Path) -> None:
+    """It costs nothing then. A known manifest, ``make_env`` and the start need none of it, nor what
+    reads requirements, though the repository imports a module that none is known to bring.
+    """
+    repository = shutil.copytree(sample("marker"), tmp_path / "repository")
+    with (repository / "env.py").open("a") as entry:
+        entry.write("\n\nif HERE is None:\n    import known_to_nobody\n")
     made = f"""
 import subprocess, sys
 from envhub_sandbox import make_env
-suites = make_env({str(sample("marker"))!r})
+suites = make_env({str(repository)!r})
 """
     start = """
 starts = subprocess.Popen.__init__
@@ -393,7 +400,7 @@ subprocess.Popen.__init__ = watched
 suites.env.reset()
 sys.exit()
 """
-    late = {"cloudpickle", "huggingface_hub", "zmq"}
+    late = {"cloudpickle", "huggingface_hub", "packaging", "tomllib", "zmq"}
     loaded_by(made)  # from here on the manifest is known
     when_it_starts = loaded_by(made + start)
     assert "envhub_sandbox" in when_it_starts
