@@ -169,11 +169,7 @@ class Builder:
         # ``spread``, where further runners may have returned something else. Only then the shards
         # are built, and the lane is opened last, since it attaches to environments that exist.
         self._check_manifest(loaded)
-        if self._keeps and not loaded.jail.kept:
-            loaded.jail.keep(deadline)
-        idle_s = self._repository.timeouts.idle_s
-        if idle_s is not None and idle_s < float("inf"):
-            loaded.jail.expire(idle_s, deadline)
+        loaded.jail.keep(self._keeps, self._repository.timeouts.idle_s, deadline)
         runners = self._launcher.spread(loaded, len(self._bounds), deadline, self._manifest)
         self._check_manifest(loaded)
         relay = self._relay(loaded, runners)

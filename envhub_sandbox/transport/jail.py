@@ -133,16 +133,15 @@ class JailHandle:
         self.runners += started
         return started
 
-    def keep(self, deadline: Deadline) -> None:
-        """Keep the jail when a runner dies."""
-        reply, _ = self.client.request(m.KeepJail(self.number), deadline=deadline)
-        expect_reply(reply, m.Done)
-        self.kept = True
-
-    def expire(self, idle_s: float, deadline: Deadline) -> None:
-        """Have the server end the jail once it has been idle for ``idle_s``."""
-        message = m.ExpireIdle(self.number, max(1, int(idle_s * 1000)))
-        expect_reply(self.client.request(message, deadline=deadline)[0], m.Done)
+    def keep(self, runners: bool, idle_s: float | None, deadline: Deadline) -> None:
+        """Keep the jail when one of its ``runners`` dies, but no longer than ``idle_s`` when it is
+        idle. Asks the server only if it would do otherwise.
+        """
+        idle_ms = 0 if idle_s in (None, float("inf")) else max(1, int(idle_s * 1000))
+        if idle_ms or (runners and not self.kept):
+            message = m.KeepJail(self.number, runners, idle_ms)
+            expect_reply(self.client.request(message, deadline=deadline)[0], m.Done)
+            self.kept = self.kept or runners
 
     def replace_runners(self, dead: Sequence[int], deadline: Deadline) -> list[int]:
         """Fork a new runner for each dead one; returns the new numbers, in order."""

@@ -57,9 +57,8 @@ def test_another_clients_jail_is_not_there(alice: Any, mallory: Peer) -> None:
     for request in (
         m.StartRunners(jail.number, 1),
         m.CheckJail(jail.number, ""),
-        m.KeepJail(jail.number),
+        m.KeepJail(jail.number, True, 1),
         m.ShareSlabs(jail.number, ()),
-        m.ExpireIdle(jail.number, 1),
         m.FollowOutput(jail.number, 0),
         m.Relay(jail.number, "step", ((jail.runners[0], 1),)),
     ):

@@ -239,7 +239,6 @@ _HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], m.Message | None]
     m.StartRunners: Jails.start_more,
     m.KeepJail: Jails.keep,
     m.ShareSlabs: Jails.share,
-    m.ExpireIdle: Jails.expire,
     m.CloseJail: Jails.close_jail,
     m.CheckJail: Jails.check,
     m.FollowOutput: Jails.follow_output,

@@ -264,14 +264,11 @@ class Jails:
         return m.Done()
 
     def keep(self, asker: Asker, request: m.KeepJail) -> m.Message:
-        """Keep a jail alive when one of its runners dies."""
-        self._owned(asker, request.jail).kept = True
-        return m.Done()
-
-    def expire(self, asker: Asker, request: m.ExpireIdle) -> m.Message:
-        """Set the time without requests after which a jail ends."""
+        """Note whether a jail outlives its runners, and how long it lives without requests."""
         entry = self._owned(asker, request.jail)
-        entry.idle = entry.idle or IdleTimer(request.idle_ms / 1000)
+        entry.kept = entry.kept or request.runners
+        if request.idle_ms:
+            entry.idle = entry.idle or IdleTimer(request.idle_ms / 1000)
         return m.Done()
 
     def look(self) -> None:

@@ -41,7 +41,7 @@ SAMPLES: list[m.Message] = [
     m.Deposit(bytes(range(16)), 3, 1), m.OfferSnapshot((("env.py", 3, bytes(32)),)),
     m.MissingBlobs("sha256:00", (bytes(32),)), m.PutBlob(bytes(32), 4096), m.KeepAlive((3, 4)),
     m.CompressionHeader("lz4", (-1, 4096)),
-    m.GetSessions(), m.ExpireIdle(3, 60_000), m.KeepJail(3),
+    m.GetSessions(), m.KeepJail(3, True, 60_000),
     m.Sessions(({"client": "a", "session": "b", "heard_s": 0.5, "jails": ()},), {"pid": 7}),
     m.ShareSlabs(3, ((1, 2, 66_368, 256), (2, 2, 66_368, 128))),
     m.NeedPackages(

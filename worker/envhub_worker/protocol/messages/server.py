@@ -216,9 +216,13 @@ TAKEN, NOT_YET = b"k", b"w"
 
 
 class KeepJail(Message, kind=17):
-    """From now on a runner's death does not end the jail. Reply: ``Done``, or ``Death``."""
+    """Say what a jail outlives. Reply: ``Done``, or ``Death``."""
 
     jail: int
+    runners: bool
+    """Whether a runner's death does not end it from now on."""
+    idle_ms: int
+    """It ends after so many milliseconds without a request; 0 means never."""
 
 
 class OfferSnapshot(Message, kind=19):
@@ -282,13 +286,6 @@ class OutputBytes(Message, kind=29):
 
     start: int
     data: bytes
-
-
-class ExpireIdle(Message, kind=30):
-    """End a jail after so many milliseconds without a request. Reply: ``Done``, or ``Death``."""
-
-    jail: int
-    idle_ms: int
 
 
 class NeedPackages(Message, kind=31):
