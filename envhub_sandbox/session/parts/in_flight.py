@@ -24,6 +24,7 @@ from gymnasium.error import NoAsyncCallError
 from envhub_sandbox.errors import ActionError, EnvHubError, RemoteEnvWarning, WorkerTimeoutError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.failures import refusal
+from envhub_sandbox.session.parts.received_infos import gather_infos
 from envhub_sandbox.session.parts.shard_queue import ShardQueue
 from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.session.requests import SENT, MessageFor, RequestOrder
@@ -307,7 +308,7 @@ class InFlight:
                 np.concatenate(rewards),
                 np.concatenate(terminations),
                 np.concatenate(truncations),
-                batches.gather_infos(infos, sizes, DEFAULT_LIMITS.message_bytes),
+                gather_infos(infos, sizes, DEFAULT_LIMITS.message_bytes),
                 env_ids,
             )
         self._ready = deque(entry for entry in self._ready if taken.get(entry[0]) is not entry[1])

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from envhub_sandbox.session.parts.received_infos import gather_infos
 from envhub_worker.protocol.spaces import batches
 from tests.compliance.test_join_infos import INFO
 from tests.support.compare import assert_same
@@ -38,7 +39,7 @@ def test_what_fits_is_joined_as_ever(infos: list[dict[str, Any]], data: st.DataO
         except Exception:
             return
     if all(_fits(part, wanted) for part in each):
-        assert_same(wanted, batches.gather_infos(each, sizes, _ROOM), "infos")
+        assert_same(wanted, gather_infos(each, sizes, _ROOM), "infos")
 
 
 def _fits(part: dict[Any, Any], whole: dict[Any, Any]) -> bool:
@@ -71,7 +72,7 @@ UNLIKE = st.fixed_dictionaries({}, optional={"one": ANY, "other": ANY})
 @example([{"other": {"b": ""}}, {"other": {"a": 0, "b": ""}}, {"other": 0}])
 def test_each_has_its_own_whatever_the_others_say(infos: list[dict[str, Any]]) -> None:
     each, sizes = [joined([info]) for info in infos], [1] * len(infos)
-    gathered = batches.gather_infos(each, sizes, _ROOM)
+    gathered = gather_infos(each, sizes, _ROOM)
     for index, info in enumerate(infos):
         for key in ("one", "other"):
             assert_same(info.get(key), member(gathered, key, index), key)
@@ -98,10 +99,10 @@ def test_a_few_bytes_make_no_large_column() -> None:
     """A worker's large array is its own; as a column of all it would be a hundred times that."""
     large = joined([{"large": np.zeros(1 << 17, np.uint8)}])
     few = joined([{"large": np.ones(1 << 17, np.uint8)}])
-    gathered = batches.gather_infos([large, *[few] * 99], [1] * 100, _ROOM)
+    gathered = gather_infos([large, *[few] * 99], [1] * 100, _ROOM)
     assert gathered["large"].dtype == object
     assert [int(one[0]) for one in gathered["large"]] == [0, *[1] * 99]
-    assert batches.gather_infos([large, few], [1, 1], _ROOM)["large"].shape == (2, 1 << 17)
+    assert gather_infos([large, few], [1, 1], _ROOM)["large"].shape == (2, 1 << 17)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +112,7 @@ def test_lies_about_masks_do_no_harm(mask: Any) -> None:
     lie = {"x": np.array([1]), "_x": mask}
     honest = joined([{"x": 0.5}])
     for each in ([lie, honest], [honest, lie]):
-        gathered = batches.gather_infos(each, [1, 1], _ROOM)
+        gathered = gather_infos(each, [1, 1], _ROOM)
         at = each.index(honest) if each[0] is honest else 1
         assert gathered["x"][at] == 0.5
         assert bool(gathered["_x"][at])
