@@ -58,7 +58,7 @@ class ManifestCache:
         self._path = None if key is None else folder / key
 
     def shard_trials(self, lane: str) -> ShardTrials:
-        """The step times of the environments with this lane, in a file beside the entry."""
+        """The step times of earlier uses over this lane, from a file beside the entry."""
         if self._path is None:
             return ShardTrials(None)
         path = self._path.with_suffix(f".{lane}-shards")

@@ -197,7 +197,7 @@ class ServerPool(Generic[S]):
             # now gets a new one.
             use.live = False
             if entry.uses():
-                return True  # the last of these uses gives the server up
+                return True  # the server stays until its last use ends
             slot = entry.pid, entry.key, entry.group
             if self._used.get(slot) is entry:
                 del self._used[slot]

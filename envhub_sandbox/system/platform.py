@@ -290,7 +290,7 @@ def wrong_on_windows(path: str) -> str | None:
 
 
 def wrong_here(path: str) -> str | None:
-    """``wrong_on_windows`` on Windows; None elsewhere."""
+    """The answer of ``wrong_on_windows`` on Windows; None elsewhere."""
     return wrong_on_windows(path) if IS_WINDOWS else None
 
 

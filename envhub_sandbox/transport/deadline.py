@@ -131,7 +131,7 @@ class StartupDeadline(Deadline):
         self.unasked = unasked
 
     def give_up(self) -> None:
-        """End the deadline now; the work is not in advance any more."""
+        """End the deadline now: nobody asks for the work any more."""
         self.unasked = True
         self._at = 0.0
 

@@ -86,7 +86,7 @@ class ShardTrials:
         """Remember the time of a step. Failing to write the cache is no error."""
         chosen = not env.sync and env.num_envs > 1 and self.may_share(env)
         if self._path is None or not chosen or not 0 < step_s < _LONGEST_S:
-            return  # the time must not be remembered, or there is no choice
+            return  # nothing can be remembered, or there was no choice of processes
         entries = self._read()
         notes = [note for note in self._notes(entries, env) if note != self._noted]
         self._noted = (_name(bounds), step_s)  # the later note of a use replaces the earlier

@@ -38,7 +38,7 @@ _SLICED: dict[type[m.Message], tuple[str, ...]] = {
     m.GetOne: (),
     m.CallOne: (),
 }
-"""The messages of which each shard is sent another part, and the fields that are joined again."""
+"""Messages of which each shard is sent its own part, and the fields to join again."""
 
 
 class RecordedRequest(NamedTuple):

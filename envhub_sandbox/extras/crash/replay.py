@@ -14,7 +14,7 @@ from envhub_worker.protocol import messages as m
 
 _SHOWN = 64
 _UNFIT = (ActionError, TypeError, ValueError)
-"""What another environment than it was raises before it is asked."""
+"""Errors that are raised before the request is sent if the environment has changed."""
 
 
 class Verdict(str, Enum):

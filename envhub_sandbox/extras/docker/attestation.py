@@ -21,7 +21,7 @@ _NATIVE_RUNTIMES = (None, "runc", "crun", "io.containerd.runc.v2")
 
 
 def parse(line: bytes) -> Surroundings:
-    """Parses a server's announcement. Raises ``WorkerStartupError``: the text is none."""
+    """Parses a server's announcement. Raises ``WorkerStartupError``: it is malformed."""
     try:
         with UNTRUSTED:
             return Surroundings.read(json.loads(line))

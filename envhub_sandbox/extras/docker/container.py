@@ -169,7 +169,7 @@ class RepositoryContainer(Sandbox):
         )
 
     def wanted(self, folder: Path, seccomp: dict[str, Any], cpus: int) -> Container:
-        """The container, without what it is shown of this machine, as the image's own user.
+        """The container as the image's own user, before any files of this machine are added.
         ``folder``: the client's runtime folder, where the system call profile is written.
         ``cpus``: how many processors there are for it.
         """

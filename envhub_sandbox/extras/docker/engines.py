@@ -222,7 +222,7 @@ _WITHOUT_LIMITS = (
 
 def explained(engine: str, stderr: str, *, limited: bool = True) -> str:
     """What an engine's complaint means, and the command that mends it.
-    ``limited``: whether it was asked for limits; to go without is no advice where it was not.
+    ``limited``: whether it was asked for limits; if not, the advice is not to leave them out.
     """
     for text, meaning in _EXPLAINED:
         if text in stderr:

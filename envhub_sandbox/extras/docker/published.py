@@ -167,7 +167,7 @@ class EngineRun:
         return json.dumps(ended).encode()
 
     def _read(self, process: subprocess.Popen[bytes]) -> None:
-        """Take what it says, to the end: else it would wait. The first of it is looked at."""
+        """Read all of its output, so that it never waits for us; look for the announcement."""
         assert process.stdout is not None
         line = b""
         while data := process.stdout.read1(_LINE_BYTES):  # type: ignore[attr-defined]

@@ -20,7 +20,7 @@ from envhub_sandbox.extras.sources.parsing import ImportStatement, ParsedFile
 BEGINNING = 8192
 """First bytes, which decide the kind of a file."""
 ENDING = (1 << 16) + 22
-"""Last bytes, which Python searches for the end of a zip archive, whatever precedes it."""
+"""Last bytes, in which Python looks for the end of a zip archive; anything may precede it."""
 LARGE = 10 << 20
 _MACHINE_CODE = (
     *(b"\x7fELF", b"MZ", b"!<arch>\n", b"\0asm", b"\xca\xfe\xba\xbe"),

@@ -277,7 +277,7 @@ class Static:
         return {statement.name: statement for statement in reversed(self.imports)}
 
     def is_brought(self, module: str) -> bool:
-        """Tells whether a package of a module's name is declared, or in every sandbox.
+        """Tells whether a module's name is that of a declared package, or of one in every sandbox.
 
         Some packages have another name than their modules.
         """

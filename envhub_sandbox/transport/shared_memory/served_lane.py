@@ -188,8 +188,7 @@ class ServedShard(ShardSlabs):
         self._received: Sequence[Buffer] = ()  # the observation slab, as the server sent it
         leaves = len(layout.actions)
         self.sizes = leaves, layout.request_bytes, observed.total_bytes
-        # A step is these two in a row: the words of the header that are the client's, and the
-        # actions.
+        # The bytes of a step: the client's words of the header, then the actions.
         self._words = memoryview(request)[slabs.OWN_BYTES : (slabs.DTYPES + leaves) * 8]
         self._written = memoryview(request)[slabs.HEADER_BYTES : layout.message]
 

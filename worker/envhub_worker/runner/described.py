@@ -39,7 +39,7 @@ def described(value: object) -> tuple[int, object] | None:
         if type(value) is np.random.Generator and type(value.bit_generator) in BIT_GENERATORS:
             return GENERATOR, value.bit_generator.state
     except (AttributeError, TypeError, ValueError, EnvHubError):
-        pass  # a subclass that is half of one: then its repr has to do
+        pass  # an incomplete subclass: its repr is sent instead
     return None
 
 

@@ -84,7 +84,7 @@ class Task:
         assert self.recording is not None
         sync, pairs = self.recording.sync, [_spaces_of(env) for env in envs]
         text = differing(sync, pairs)
-        if text and start:  # which speaks of the first of all
+        if text and start:  # the text names the first sub-environment of the whole task
             text = differing(sync, [_spaces_of(self.learn_spaces()), *pairs])
         if text:
             raise RuntimeError(text)

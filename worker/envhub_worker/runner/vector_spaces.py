@@ -131,7 +131,8 @@ def _settled(
         return (batched, batch_space(batched, count)) if row is None else (row, batched)
     if batched is None or (side is False and _is_open(single, batched)):
         return single, batch_space(single, count)
-    return single, batched  # its own decides, also where that is no batch of the single one
+    # the environment's own batched space decides, even if it is no batch of the single one
+    return single, batched
 
 
 def _looks_batched(space: Space, count: int) -> bool:

@@ -87,7 +87,7 @@ class Channel:
         try:
             data, fds, flags = self._receive()
         except ConnectionResetError:
-            # Comes once, when the peer closed with our messages unread; its own still come.
+            # Raised once if the peer closed without reading our messages; its own still arrive.
             data, fds, flags = self._receive()
         if not data:
             return None

@@ -145,7 +145,7 @@ def user_namespace_unavailable(
 
 
 def _diagnosis(error: OSError, read: Callable[[str], str | None]) -> tuple[str, str]:
-    if read("/proc/sys/user/max_user_namespaces") == "0":  # answered by ENOSPC
+    if read("/proc/sys/user/max_user_namespaces") == "0":  # the kernel answers ENOSPC then
         return "user.max_user_namespaces is 0", "Run: sudo sysctl user.max_user_namespaces=15000."
     if read("/proc/sys/kernel/unprivileged_userns_clone") == "0":
         return (

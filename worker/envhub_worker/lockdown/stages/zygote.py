@@ -178,7 +178,7 @@ def _become(config: ZygoteConfig, at_parents_death: int) -> None:
 
 
 def _check_interpreter() -> None:
-    """Check that the new user may read the interpreter, which no private root shows it."""
+    """Check that the new user may read the interpreter, since there is no private root."""
     for path in (os.__file__, sys.prefix, __file__):
         if not os.access(path, os.R_OK):
             raise LayerUnavailableError(

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from envhub_worker.protocol.codec.arrays import ArrayWriter
 
 Describer = Callable[[object], "tuple[int, object] | None"]
-"""The code and the plain value of what the peer can make again; None of all else."""
+"""Returns the code and plain value of an object that the peer can rebuild; None for others."""
 
 
 class Encoder:
