@@ -15,6 +15,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import ParamSpec, TypeVar
 
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
+
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerError
 from envhub_sandbox.system.log import ERRORS
 from envhub_worker.protocol.text import shortage
@@ -23,6 +25,8 @@ _VARIABLE, _FULL = "ENVHUB_TRACEBACK", "full"
 _SHORT = 3
 """The most frames of an error that was shortened before and passes another of our methods."""
 _CHAINED = 20
+RAISED = (EnvHubError, AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError)
+"""What an environment raises by itself."""
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -51,7 +55,7 @@ def short_traceback(ask: Callable[P, T]) -> Callable[P, T]:
     def asked(*args: P.args, **kwargs: P.kwargs) -> T:
         try:
             return ask(*args, **kwargs)
-        except EnvHubError as error:
+        except RAISED as error:
             if not shortened(error):
                 raise
             __tracebackhide__ = True  # pytest hides the frame then
@@ -66,7 +70,7 @@ def short_traceback(ask: Callable[P, T]) -> Callable[P, T]:
 
 
 def _text_suffices(error: BaseException) -> bool:
-    return isinstance(error, EnvHubError) and not isinstance(error, RemoteProtocolError)
+    return isinstance(error, RAISED) and not isinstance(error, RemoteProtocolError)
 
 
 def _shorten_causes(error: BaseException) -> None:

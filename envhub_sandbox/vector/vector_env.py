@@ -19,7 +19,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorEnv
 
-from envhub_sandbox.errors import EnvHubError, RemoteEnvError
+from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.session.requests import SENT, MessageFor, for_every_shard
 from envhub_sandbox.system.log import warn_caller
 from envhub_sandbox.system.platform import OwnerProcess
@@ -33,7 +33,7 @@ from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.send_recv import SendRecv
 from envhub_sandbox.vector.space_copies import SpaceCopies
 from envhub_sandbox.vector.sub_environment import SubEnvironment
-from envhub_sandbox.vector.tracebacks import short_traceback, shortened
+from envhub_sandbox.vector.tracebacks import RAISED, short_traceback, shortened
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.manifest.names import absent, is_servable
@@ -274,7 +274,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         try:  # without decorator and step_async, for speed: no method is called more often
             done = self._step(actions)
             return (*done[:4], results.joined(done[4])) if results.apart else done
-        except EnvHubError as error:
+        except RAISED as error:
             if shortened(error):
                 __tracebackhide__ = True  # pytest hides the frame then
                 raise error  # ENVHUB_TRACEBACK=full shows where

@@ -6,6 +6,7 @@ import traceback
 from collections.abc import Callable
 
 import pytest
+from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import errors
 from envhub_sandbox.vector.tracebacks import short_traceback
@@ -51,11 +52,12 @@ def frames(error: BaseException, asking: Callable[..., None] = ask) -> list[str]
         errors.PolicyError("no"),
         errors.LocalProtocolError("no"),
         errors.WorkerDiedError("no", reason="exit"),
+        ClosedEnvironmentError("no"),
     ],
     ids=lambda error: type(error).__name__,
 )
 @pytest.mark.parametrize("asking", [ask, ask_by_another])
-def test_one_frame_of_ours_is_left(error: errors.EnvHubError, asking: Callable[..., None]) -> None:
+def test_one_frame_of_ours_is_left(error: Exception, asking: Callable[..., None]) -> None:
     assert frames(error, asking) == ["asked"]
     assert error.__traceback__.tb_next.tb_frame.f_locals["__tracebackhide__"] is True
     [*_, shown] = traceback.extract_tb(error.__traceback__)
