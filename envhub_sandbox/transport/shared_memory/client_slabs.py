@@ -261,8 +261,12 @@ class ShardSlabs:
                 self._asks[slabs.KNOWN] = max(known, default=0)
         return kind, message
 
-    def answer(self, limits: WireLimits = DEFAULT_LIMITS) -> m.Message | None:
-        """The answer to a message; None if it did not fit. Trust: as ``outcome``."""
+    def answer(
+        self, limits: WireLimits = DEFAULT_LIMITS, space: gym.Space[Any] | None = None
+    ) -> m.Message | None:
+        """The answer to a message; None if it did not fit. Trust: as ``outcome``.
+        ``space``: as for ``StepColumns``.
+        """
         kind, length = self._tells[slabs.OUTCOME], self._tells[slabs.LENGTH]
         if kind == slabs.FETCH:
             return None
@@ -279,13 +283,15 @@ class ShardSlabs:
             frames = read_packet(area[:length], limits)
         borrows = slots is not None and slots.chosen != _SPARE
         message = unpacked(frames, limits=limits, borrows=borrows)
-        if slots is not None and type(message) is m.StepDone and self._tells[slabs.OFFERED]:
+        offered = self._tells[slabs.OFFERED]
+        if slots is not None and type(message) is m.StepDone and offered:
             # 0 until the columns exist: after an interrupt the runner sends none that we lack
             self._asks[slabs.DERIVED] = 0
             with suppress(IrregularError):
-                columns = StepColumns(m.values_of(message), slots.slot_bytes)
-                self._form = self._step_columns = columns
-                self._asks[slabs.DERIVED] = self._asks[slabs.SEQUENCE]
+                columns = StepColumns(m.values_of(message), slots.slot_bytes, space)
+                if columns.digest == offered:  # the runner's Gymnasium may know other spaces
+                    self._form = self._step_columns = columns
+                    self._asks[slabs.DERIVED] = self._asks[slabs.SEQUENCE]
         return message
 
     def _step_of_columns(self, length: int, slots: SlotRing) -> list[Any]:
@@ -308,9 +314,11 @@ class ShardSlabs:
             return None
         return self._step_of_columns(tells[slabs.LENGTH], slots)
 
-    def note_checked(self) -> None:
-        """Note that the classes, dtypes and shapes of the last step's answer are as declared."""
-        if self._form is not None:
+    def note_checked(self, restores: bool) -> None:
+        """Note that the classes, dtypes and shapes of the last step's answer are as declared.
+        ``restores``: as for ``Results``.
+        """
+        if self._form is not None and (self._form.has_classes or not restores):
             self._checked_form = self._form
 
     def columns(self) -> dict[Any, Any]:

@@ -230,8 +230,7 @@ class SharedMemoryLane(SlabLane):
             return
         deaths = self._wait_for_all(deadline)
         # the results of several shards have to be joined, so they are always checked
-        alone = len(self.shards) == 1 and not self.declared.restores
-        if self._asked == STEP and not deaths and alone:
+        if self._asked == STEP and not deaths and len(self.shards) == 1:
             self._checked = self.shards[0].checked_step()
         if self._checked is None:
             self._answers = self._replies(deaths, deadline)
@@ -244,7 +243,7 @@ class SharedMemoryLane(SlabLane):
             return observation, rewards, ended, cut, own
         done = super().result()
         if self._asked == STEP:
-            self.shards[0].note_checked()
+            self.shards[0].note_checked(self.declared.restores)
         return done
 
     def leave_slots(self) -> None:
@@ -261,7 +260,8 @@ class SharedMemoryLane(SlabLane):
     def _replies(self, deaths: dict[int, WorkerDiedError], deadline: Deadline) -> list[m.Message]:
         operation = self._asked
         living = [index for index in range(len(self.shards)) if index not in deaths]
-        answers = {index: self.shards[index].answer(self.jail.limits) for index in living}
+        limits, space = self.jail.limits, self.declared.manifest.single_observation_space
+        answers = {index: self.shards[index].answer(limits, space) for index in living}
         missing = [index for index, answer in answers.items() if answer is None]
         answers.update(self._fetched(missing, deaths, deadline))
         if operation != STEP:

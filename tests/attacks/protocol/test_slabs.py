@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -325,7 +326,8 @@ def test_columns_of_a_step_are_numbers_and_texts_of_its_form(
     step = m.StepDone(np.zeros(2), np.zeros(2), flags, flags, infos)
     packet = _packet(*map(bytes, m.pack(step)))
     os.pwrite(ring.fd, packet, 0)
-    offered = struct.pack("QQQ", slabs.DONE, len(packet), 1)
+    digest = StepColumns(m.values_of(step), SLOT).digest
+    offered = struct.pack("QQQ", slabs.DONE, len(packet), digest)
     attack(shard, f"os.pwrite(reply, {offered!r}, {slabs.OUTCOME * 8})")
     assert isinstance(shard.answer(), m.StepDone)
     attack(
@@ -352,6 +354,74 @@ def test_columns_of_a_step_are_numbers_and_texts_of_its_form(
         assert answer.info == {"log": {"loss": 0.5, "steps": 3}, "name": "run"}
         assert answer.terminations.tobytes() == answer.truncations.tobytes() == b"\x01\x01"
         assert answer.observation.tobytes() == b"\x02" * 16
+
+
+FLAGS = spaces.Sequence(spaces.MultiBinary(2))
+WORDS = spaces.OneOf([spaces.Sequence(spaces.Text(9)), spaces.Graph(spaces.Box(-1, 1, (2,)), None)])
+_INT8, _BOOL = [slabs.DTYPE_CODES[np.dtype(kind)] for kind in (np.int8, np.bool_)]
+
+
+@pytest.mark.parametrize(
+    ("space", "numbers", "text", "refusal"),
+    [
+        (FLAGS, [2, 1, _INT8], "", ""),
+        (FLAGS, [2, 1, _BOOL], "", ""),
+        (FLAGS, [2, 1, 99], "", "unknown dtype"),
+        (FLAGS, [2, 1, -1], "", "unknown dtype"),
+        (FLAGS, [-1, 4, _INT8], "", "negative size"),
+        (FLAGS, [2, slabs.INFO_BYTES, _INT8], "", "more items"),
+        (FLAGS, [2, 2**62, _INT8], "", "more items"),
+        (FLAGS, [2, SLOT // 2, _INT8], "", "larger than its slot"),
+        (FLAGS, [2], "", "fewer sizes"),
+        (FLAGS, [2, 1, _INT8, 0], "", "other sizes"),
+        (FLAGS, [2, 1, _INT8], "x", "other sizes"),
+        (WORDS, [-1, 0, 0, 1, 0, 4, 0, 0, 0], "word", ""),
+        (WORDS, [-1, 0, 2, 1, 0, 4, 0, 0, 0], "word", "does not have"),
+        (WORDS, [_BOOL, 0, 0, 1, 0, 4, 0, 0, 0], "word", "unknown dtype"),
+        (WORDS, [-1, 0, 0, 1, 0, 5, 0, 0, 0], "word", "other sizes"),
+        (WORDS, [-1, 0, 0, 1, 0, -4, 0, 0, 0], "word", "negative size"),
+        (WORDS, [-1, 0, 0, 1, 2**62, 4], "word", "fewer sizes"),
+        (WORDS, [-1, 1, 1, _INT8, -2, 0], "", "negative size"),
+        (WORDS, [-1, 1, 1, _INT8, 2**62, 2**62], "", "larger than its slot"),
+    ],
+)
+def test_sizes_of_members_that_vary_are_read_within_what_there_is(
+    asked: Asked, space: Any, numbers: list[int], text: str, refusal: str
+) -> None:
+    """Of two members; the cases without a refusal are the controls."""
+    ring, shard = asked
+    sample = ((np.ones(2, np.int8),), ()) if space is FLAGS else ((0, ("a",)), (0, ()))
+    flags = np.zeros(2, np.bool_)
+    step = m.StepDone(sample, np.zeros(2), flags, flags, {})
+    columns, packet = (
+        StepColumns(m.values_of(step), SLOT, space),
+        _packet(*map(bytes, m.pack(step))),
+    )
+    os.pwrite(ring.fd, packet, 0)
+    offered = struct.pack("QQQ", slabs.DONE, len(packet), columns.digest)
+    attack(shard, f"os.pwrite(reply, {offered!r}, {slabs.OUTCOME * 8})")
+    shard.answer(space=space)
+    scalars = msgpack.packb([np.array(numbers, np.int64).tobytes(), text])
+    told = struct.pack("QQ", slabs.COLUMNS, len(scalars))
+    attack(
+        shard,
+        f"os.pwrite(observations, b'\x02' * {SLOT}, 0)\n"
+        f"os.pwrite(reply, {scalars!r}, {slabs.INFOS})\n"
+        f"os.pwrite(reply, {told!r}, {slabs.OUTCOME * 8})",
+    )
+    if refusal:
+        with pytest.raises(RemoteProtocolError, match=refusal):
+            shard.answer(space=space)
+        return
+    answer = shard.answer(space=space)
+    attack(shard, f"os.pwrite(observations, bytes({SLOT}), 0)")
+    assert isinstance(answer, m.StepDone)
+    if space is WORDS:
+        assert answer.observation == ((0, ("word",)), (0, ()))
+    else:
+        byte = 1 if numbers[-1] == _BOOL else 2
+        members = [[row.tobytes() for row in member] for member in answer.observation]
+        assert members == [[bytes([byte]) * 2] * 2, [bytes([byte]) * 2]]
 
 
 FRAMES = {

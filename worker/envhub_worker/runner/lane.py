@@ -15,6 +15,7 @@ from functools import lru_cache, partial
 from time import perf_counter_ns
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from envhub_worker.protocol import messages as m
@@ -40,6 +41,7 @@ class Lane:
 
     Args:
         attach: The request that brought the slabs: rows, number of slots.
+        space: The space of one sub-environment's observations, if steps are messages.
         fds: Request slab, reply slab, observation slab, our doorbell, the client's doorbell. The
             lane owns them.
         read: Decodes the frames of a request.
@@ -61,6 +63,7 @@ class Lane:
     def __init__(
         self,
         attach: m.Attach,
+        space: gym.Space[Any] | None,
         fds: list[int],
         read: Callable[[list[Any]], m.Message],
         answer: Callable[[m.Message, Callable[[m.Message], bool]], list[Any]],
@@ -68,6 +71,7 @@ class Lane:
         warned: Sequence[Any],
         watches: Watches,
     ) -> None:
+        self._space = space
         self.number = attach.env
         self.unsent: list[Any] = []
         self.was_awake = False
@@ -243,8 +247,9 @@ class Lane:
         if missed >= self._offers_at:
             self._offers_at = missed + 1 + min(missed // 8, _SELDOM)
             with contextlib.suppress(IrregularError):
-                self._columns = self._asked[slabs.SEQUENCE], StepColumns(values, self._slot_bytes)
-                self._told[slabs.OFFERED] = 1
+                columns = StepColumns(values, self._slot_bytes, self._space)
+                self._columns = self._asked[slabs.SEQUENCE], columns
+                self._told[slabs.OFFERED] = columns.digest
                 self._offers_at = missed + min(missed + 1, _SELDOM)
         return False
 

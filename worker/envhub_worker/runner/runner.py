@@ -287,7 +287,9 @@ class Runner:
     def attach(self, request: m.Attach) -> m.Message:
         """Serve an environment's steps over slabs from now on."""
         env = self._envs[request.env]
+        space = None if request.count else getattr(env, "single_observation_space", None)
         options: tuple[Any, ...] = (
+            space,
             self.descriptors,
             self.read,
             self._reply_to,

@@ -50,7 +50,7 @@ def slab_lane() -> tuple[Lane, Any, Any]:
     bells = [os.memfd_create("bell") for _ in range(2)]
     others: Any = [None, None, raised]
     attach = m.Attach(1, 0, 0, 1)
-    return Lane(attach, [*memory, *bells], *others, (), Watches()), request, reply
+    return Lane(attach, None, [*memory, *bells], *others, (), Watches()), request, reply
 
 
 def test_a_lane_that_is_closed_owes_nothing(slab_lane: tuple[Lane, Any, Any]) -> None:

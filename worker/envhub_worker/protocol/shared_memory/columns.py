@@ -5,7 +5,8 @@ the columns from one encoded message; while later results have that form, only t
 texts are written. No offset, class or key comes from the jail in between.
 
 Arrays, and bits of tensors, have a place each in the slot of the observation slab. Scalars are a
-list in msgpack, in the reply slab's area of infos.
+list in msgpack, in the reply slab's area of infos. Members of a space whose sizes vary have sizes
+among the scalars, and arrays behind the others (``ragged``).
 """
 
 from __future__ import annotations
@@ -13,24 +14,29 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
+from zlib import crc32
 
+import gymnasium as gym
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
+from gymnasium import spaces
 
 from envhub_worker.protocol.codec import arrays
 from envhub_worker.protocol.codec.decoder import TensorMaker
 from envhub_worker.protocol.errors import UNTRUSTED, RemoteProtocolError
 from envhub_worker.protocol.messages.forms import IrregularError
+from envhub_worker.protocol.shared_memory import ragged
 from envhub_worker.protocol.shared_memory.words import INFO_BYTES, LINE
 from envhub_worker.protocol.spaces.batches import APART_CLASSES
 
 _MAX_PARTS = 1024
 _PLAIN = frozenset({float, int, bool, str})
 _AS_TUPLES = (tuple.__iter__, tuple.__len__)
-New = tuple[list[Any], list[Any]]
-"""Scalars and arrays of new results, in the order of the columns."""
+New = tuple[list[Any], list[Any], list[Any]]
+"""Scalars and arrays of new results, in the order of the columns, and arrays of varying sizes."""
 _Take = Callable[[Any, New], None]
 """Adds the scalars and arrays of a part; raises ``IrregularError``: it has another form."""
 _Make = Callable[[Iterator[Any], Iterator[Any]], Any]
@@ -42,30 +48,70 @@ class StepColumns:
     Args:
         values: The fields of one message.
         room: Bytes of a slot.
+        space: The space of one sub-environment's part of the first field, an observation.
 
     Attributes:
-        nbytes: Bytes of a slot that the arrays take.
+        nbytes: Bytes of a slot that the arrays of fixed sizes take.
+        digest: Differs if the peer derives other columns; not 0.
+        has_classes: Whether members have the classes that Gymnasium gives them (``GraphInstance``).
 
     Raises:
         IrregularError: The values are not only numbers, texts, arrays of numbers, tensors, None and
             bytes, in tuples, lists and dicts with text keys; or are too many, or too large.
     """
 
-    def __init__(self, values: Sequence[Any], room: int) -> None:
+    def __init__(
+        self, values: Sequence[Any], room: int, space: gym.Space[Any] | None = None
+    ) -> None:
         self._scalars: list[type] = []  # classes, in the order of the columns
         # Of each array: shape, dtype, offset in a slot, and its tensor's dtype by name, or "".
         self._arrays: list[tuple[tuple[int, ...], np.dtype[Any], int, str]] = []
         self.nbytes, self._room, self._parts = 0, room, 0
         self._copies: dict[int, list[Callable[[], Any]]] = {}  # by the slot's start; for reading
         self._views: dict[int, list[Any]] = {}  # likewise, for writing
+        self.has_classes = True
+        self._varies = False  # whether it has members of varying sizes
+        self._area: Any = None  # where ``read`` finds arrays of varying sizes
         try:
-            self._fields = [self._part(value) for value in values]
+            self._fields = [self._observed(space, values[0]), *map(self._part, values[1:])]
         except RecursionError as error:
             raise IrregularError from error
+        self.digest = 1 + crc32(repr((self._scalars, self._arrays)).encode())
         named = enumerate(name for _, _, _, name in self._arrays)
         self._tensors = [(index, name) for index, name in named if name]
 
     # --- deriving the columns ------------------------------------------------------------------
+
+    def _observed(self, space: gym.Space[Any] | None, value: Any) -> tuple[_Take, _Make]:
+        """As ``_part``; sizes vary as the space says."""
+        if isinstance(space, spaces.Dict) and type(value) is dict:
+            if value.keys() == space.spaces.keys():
+                parts = [self._observed(space[key], item) for key, item in value.items()]
+                return _members(dict, parts, list(value))
+        elif isinstance(space, spaces.Tuple) and type(value) is tuple:
+            if len(value) == len(space.spaces):
+                parts = list(map(self._observed, space.spaces, value))
+                return _members(tuple, parts, len(parts))
+        elif space is not None and ragged.varies(space) and type(value) is tuple:
+            with suppress(IrregularError):
+                return self._varying(*ragged.members_of(space), len(value))
+            self.has_classes = False
+        return self._part(value)
+
+    def _varying(self, write: ragged.Write, read: ragged.Read, count: int) -> tuple[_Take, _Make]:
+        self._scalars += [bytes, str]
+        self._varies = True
+
+        def take(value: Any, new: New) -> None:
+            numbers, text, varying = ragged.write_members(write, count, value)
+            new[0].extend((numbers, text))
+            new[2].extend(varying)
+
+        def make(scalars: Iterator[Any], _: Iterator[Any]) -> Any:
+            received = ragged.Received(next(scalars), next(scalars), self._area)
+            return ragged.read_members(read, count, received)
+
+        return take, make
 
     def _part(self, value: Any) -> tuple[_Take, _Make]:
         self._parts += 1
@@ -77,30 +123,12 @@ class StepColumns:
         if value is None or kind is bytes:
             return partial(_take_same, value), lambda scalars, found: value
         if kind is dict and {str}.issuperset(map(type, value.keys() - {APART_CLASSES})):
-            return self._members(kind, value.values(), list(value))
+            return _members(kind, [self._part(item) for item in value.values()], list(value))
         # A named tuple crosses as its members, unless it says that it has others.
         named = issubclass(kind, tuple) and (kind.__iter__, kind.__len__) == _AS_TUPLES
         if kind is list or named:
-            return self._members(kind, value, len(value))
+            return _members(kind, [self._part(item) for item in value], len(value))
         return self._leaf(value)
-
-    def _members(self, kind: Any, items: Any, keys: Any) -> tuple[_Take, _Make]:
-        parts = [self._part(item) for item in items]
-        takes, makes = [take for take, _ in parts], [make for _, make in parts]
-
-        def take(value: Any, new: New) -> None:
-            if type(value) is not kind or (list(value) if kind is dict else len(value)) != keys:
-                raise IrregularError
-            for part, item in zip(takes, value.values() if kind is dict else value, strict=True):
-                part(item, new)
-
-        def make(scalars: Iterator[Any], found: Iterator[Any]) -> Any:
-            made = [part(scalars, found) for part in makes]
-            if kind is dict:
-                return dict(zip(keys, made, strict=True))
-            return made if kind is list else tuple(made)
-
-        return take, make
 
     def _scalar(self, kind: Any, plain: type, item: bool) -> tuple[_Take, _Make]:
         self._scalars.append(plain)
@@ -139,10 +167,12 @@ class StepColumns:
         Raises ``IrregularError``: these results have another form; nothing was written.
         """
         # All values are looked at before the first is written: a slot never holds half a step.
-        new: New = [], []
+        new: New = [], [], []
         for (take, _), value in zip(self._fields, values, strict=True):
             take(value, new)
         packed = _packed(new[0]) if new[0] else b""
+        if new[2]:
+            ragged.ArrayArea(memory, start, self._room, self.nbytes).write(new[2])
         views = self._views.get(start)
         if views is None:
             places = [(shape, dtype, start + at) for shape, dtype, at, _ in self._arrays]
@@ -171,6 +201,8 @@ class StepColumns:
             ]
         for index, name in self._tensors:
             found[index] = tensors(found[index], name)
+        if self._varies:
+            self._area = ragged.ArrayArea(memory, start, self._room, self.nbytes, slot)
         scalars: Iterator[Any] = iter(())
         taken = iter(found)
         if not self._scalars and not packed:
@@ -183,6 +215,24 @@ class StepColumns:
                 raise RemoteProtocolError("the worker wrote other scalars than it had announced")
             scalars = iter(read)
             return [make(scalars, taken) for _, make in self._fields]
+
+
+def _members(kind: Any, parts: Sequence[tuple[_Take, _Make]], keys: Any) -> tuple[_Take, _Make]:
+    takes, makes = [take for take, _ in parts], [make for _, make in parts]
+
+    def take(value: Any, new: New) -> None:
+        if type(value) is not kind or (list(value) if kind is dict else len(value)) != keys:
+            raise IrregularError
+        for part, item in zip(takes, value.values() if kind is dict else value, strict=True):
+            part(item, new)
+
+    def make(scalars: Iterator[Any], arrays: Iterator[Any]) -> Any:
+        members = [part(scalars, arrays) for part in makes]
+        if kind is dict:
+            return dict(zip(keys, members, strict=True))
+        return members if kind is list else tuple(members)
+
+    return take, make
 
 
 def _packed(scalars: list[Any]) -> bytes:

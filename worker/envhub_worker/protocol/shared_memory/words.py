@@ -24,7 +24,7 @@ LENGTH = 17
 """Reply: bytes of the encoded infos, or of what was raised; 0 for an empty info. Where a step is a
 message: of the answer, or of its scalars if it is columns."""
 OFFERED = 18
-"""Reply: 1 if the client should derive columns from the answer to this step."""
+"""Reply: the ``digest`` of the columns that the client should derive from this answer, or 0."""
 SPIN = 16
 """Request: nanoseconds that the shard may wait for the next request without sleeping."""
 SLOT = 17
