@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, LoadError
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -26,7 +26,7 @@ from envhub_sandbox.session.launcher import ExpectedManifest, Launcher, LoadedJa
 from envhub_sandbox.session.prewarm import Prewarm, SuitePrewarm
 from envhub_sandbox.session.recorder import recorder_for
 from envhub_sandbox.settings.policy import Policy
-from envhub_sandbox.system import folders
+from envhub_sandbox.system import extras, folders
 from envhub_sandbox.system.folders import cache_root, write_whole_file
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shard_trials import ShardTrials
@@ -40,9 +40,6 @@ from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest, decode_manifest
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.stream import StreamReader, pack_packet
-
-if TYPE_CHECKING:
-    from envhub_sandbox.session.parts.fleet_session import AnySession
 
 SharedJails = dict[Launcher, SharedJail]
 
@@ -269,7 +266,7 @@ class EnvFactory:
 
     def _session(
         self, manifest: Manifest, env: EnvManifest, shared: SharedJails | None
-    ) -> AnySession:
+    ) -> EnvSession:
         workers = min(len(self._launchers), env.num_envs) if env.shardable else 1
         trials = self._cache.shard_trials(self._repository.policy.lane)
         bounds = trials.bounds_for(env, self._num_workers if workers == 1 else workers)
@@ -285,8 +282,8 @@ class EnvFactory:
 
         if workers == 1:
             return EnvSession(source(self._launcher, len(bounds)), env, bounds, trials)
-        from envhub_sandbox.session.parts.fleet_session import FleetSession  # which few need
-
+        module = "envhub_sandbox.extras.several_workers.fleet_session"
+        fleet_session = extras.required(module, "FleetSession", "several workers with jails")
         seats = list(zip(self._launchers, bounds))  # noqa: B905 - there may be more places
         if self._num_workers is None and not trials.may_share(env):
             # a worker for each sub-environment, in the same sandbox
@@ -301,7 +298,8 @@ class EnvFactory:
             EnvSession(source(launcher, 1), env, [rows], unnoted, recorder)
             for launcher, rows in seats
         ]
-        return FleetSession(parts, recorder)
+        fleet: EnvSession = fleet_session(parts, recorder)  # it has the same interface
+        return fleet
 
 
 def _close_all(shared: SharedJails) -> None:

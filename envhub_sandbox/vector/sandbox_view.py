@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from envhub_sandbox.session.parts.fleet_session import AnySession
+    from envhub_sandbox.session.env_session import EnvSession
 
 
 class SandboxView:
@@ -15,7 +15,7 @@ class SandboxView:
     be called at any time, from any thread.
     """
 
-    def __init__(self, session: AnySession) -> None:
+    def __init__(self, session: EnvSession) -> None:
         self._session = session
 
     def report(self) -> list[dict[str, Any]]:

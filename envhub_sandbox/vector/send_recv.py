@@ -3,31 +3,50 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.system import extras
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.vector.actions import action_reader, reset_message, seeds_for_all
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 
-if TYPE_CHECKING:
-    from envhub_sandbox.session.parts.fleet_session import AnySession
-    from envhub_sandbox.session.parts.in_flight import InFlight, Received, Rows
+_IN_FLIGHT = "envhub_sandbox.extras.several_workers.in_flight"
+
+
+class Received(NamedTuple):
+    """Results of ``n`` sub-environments, in the order of their ids.
+
+    Attributes:
+        observations: ``(n, *single_observation_space.shape)``.
+        rewards: float64 ``(n,)``; 0 after a reset.
+        terminations, truncations: bool ``(n,)``; False after a reset.
+        infos: As in ``step``, with ``n`` rows. If workers return different dtypes or shapes for a
+            key, its value is an object array.
+        env_ids: int64 ``(n,)``, ascending.
+    """
+
+    observations: Any
+    rewards: Any
+    terminations: Any
+    truncations: Any
+    infos: dict[Any, Any]
+    env_ids: Any
 
 
 class SendRecv(VectorEnv[Any, Any, Any]):
     """The methods of a ``SandboxVectorEnv`` for requests in flight, which Gymnasium lacks."""
 
-    def __init__(self, session: AnySession) -> None:
+    def __init__(self, session: EnvSession) -> None:
         self._session = session
         self._requests = session.requests
         self._manifest = session.manifest
         self._readers: dict[int, Callable[[Any], Any]] = {}
-        self._flight: InFlight | None = None
+        self._flight: Any = None  # an ``InFlight``, once it is needed
         self.num_envs = session.manifest.num_envs
 
     @short_traceback
@@ -88,7 +107,7 @@ class SendRecv(VectorEnv[Any, Any, Any]):
         with self._requests.use.flight:
             flight = self._in_flight()
             rows = flight.rows(env_ids)
-            seeds = _seeds_of(rows, seed, self._manifest)
+            seeds = _seeds_of(rows.named, seed, self._manifest)
             self._send_draws()
             flight.send_reset(rows, reset_message(self._manifest, seeds, options))
 
@@ -126,11 +145,9 @@ class SendRecv(VectorEnv[Any, Any, Any]):
         wanted = self._session.repository.min_ready if min_ready is None else min_ready
         if wanted is not None and wanted < 1:
             raise ValueError(f"`min_ready` is {wanted}, and must be at least 1")
-        from envhub_sandbox.session.parts.in_flight import held_in_time  # which few need
-
-        deadline = Deadline(timeout)
-        with held_in_time(self._requests.use.flight, deadline):
-            received = self._in_flight().recv(self.num_envs if wanted is None else wanted, deadline)
+        deadline, flight = Deadline(timeout), self._in_flight()
+        with flight.held_in_time(deadline):
+            received: Received = flight.recv(self.num_envs if wanted is None else wanted, deadline)
             self._requests.note_answered()
             return received
 
@@ -139,22 +156,21 @@ class SendRecv(VectorEnv[Any, Any, Any]):
         if self._requests.before_request is not None and self._requests.waiting is None:
             self._requests.before_request()
 
-    def _in_flight(self) -> InFlight:
+    def _in_flight(self) -> Any:
         if self._flight is None:
-            from envhub_sandbox.session.parts.in_flight import InFlight  # which few need
-
-            session = self._session
-            parts = [session] if isinstance(session, EnvSession) else session.parts
-            self._flight = InFlight(self._requests, parts)
+            in_flight = extras.required(_IN_FLIGHT, "InFlight", "send and recv")
+            with self._requests.use.flight:
+                parts = getattr(self._session, "parts", [self._session])
+                self._flight = self._flight or in_flight(self._requests, parts)
         return self._flight
 
 
-def _seeds_of(rows: Rows, seed: Any, manifest: EnvManifest) -> Any:
-    """A list with a seed or None for every sub-environment; only the seeds of ``rows`` are used."""
+def _seeds_of(named: list[int], seed: Any, manifest: EnvManifest) -> Any:
+    """A list with a seed or None for every sub-environment; only those of ``named`` are used."""
     if seed is None or isinstance(seed, (int, np.integer)):
         return seeds_for_all(seed, manifest)
     seeds = list(seed)
-    if len(seeds) != len(rows.named):
-        raise ValueError(f"`seed` has {len(seeds)} entries for {len(rows.named)} sub-environments")
-    by_id = dict(zip(rows.named, seeds, strict=True))
+    if len(seeds) != len(named):
+        raise ValueError(f"`seed` has {len(seeds)} entries for {len(named)} sub-environments")
+    by_id = dict(zip(named, seeds, strict=True))
     return seeds_for_all([by_id.get(index) for index in range(manifest.num_envs)], manifest)

@@ -39,7 +39,7 @@ from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.manifest.names import absent, is_servable
 
 if TYPE_CHECKING:
-    from envhub_sandbox.session.parts.fleet_session import AnySession
+    from envhub_sandbox.session.env_session import EnvSession
     from envhub_sandbox.session.repository import Recipe
 
 _NOT_CALLED = frozenset({"reset", "step", "close"})
@@ -77,7 +77,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         sandbox: Its confinement, resource usage, denials and counters.
     """
 
-    def __init__(self, session: AnySession, again: Callable[[], AnySession] | None = None) -> None:
+    def __init__(self, session: EnvSession, again: Callable[[], EnvSession] | None = None) -> None:
         super().__init__(session)
         self._again = again  # makes another session after ``close``, for LeRobot
         self._owner = OwnerProcess()  # a fork must not close it

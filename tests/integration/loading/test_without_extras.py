@@ -27,7 +27,7 @@ with hub.make_env(repository, n_envs=2) as envs:
     print(env.step(env.action_space.sample())[1].shape)
 for argument, value in asked:
     try:
-        hub.make_env(**{"cfg": repository, argument: value})
+        hub.make_env(**{"cfg": repository, "n_envs": 2, argument: value})
     except errors.SandboxUnavailableError as error:
         print(str(error).splitlines()[0])
 """
@@ -41,6 +41,7 @@ _ASKED = [
     ("lock", "pylock.toml", "lock", "packages.source"),
     ("dependencies", {}, "dependencies", "packages.source"),
     ("assets", ["org/data"], "assets", "sources.assets"),
+    ("min_ready", 1, "several workers with jails", "several_workers.fleet_session"),
 ]
 """An argument, a value that needs an extra, how the error calls it, and the extra's module."""
 _OF_WORKER = [("denials", {"record_denials": True}), ("display", {"display": "virtual"})]

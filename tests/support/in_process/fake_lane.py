@@ -8,8 +8,8 @@ from typing import Any, cast
 import numpy as np
 
 from envhub_sandbox.errors import WorkerTimeoutError
+from envhub_sandbox.extras.several_workers.fleet_session import FleetSession
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.parts.fleet_session import FleetSession
 from envhub_sandbox.session.recorder import Recorder, recorder_for
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.settings.policy import Policy, Timeouts

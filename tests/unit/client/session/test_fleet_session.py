@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import errors
-from envhub_sandbox.session.parts.fleet_session import FleetRequests, FleetSession
-from envhub_sandbox.session.parts.in_flight import InFlight
+from envhub_sandbox.extras.several_workers.fleet_session import FleetRequests, FleetSession
+from envhub_sandbox.extras.several_workers.in_flight import InFlight
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
 from tests.support.in_process.fake_lane import FakeLane, fleet_over

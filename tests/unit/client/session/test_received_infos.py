@@ -9,7 +9,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from envhub_sandbox.session.parts.received_infos import gather_infos
+from envhub_sandbox.extras.several_workers.received_infos import gather_infos
 from envhub_worker.protocol.spaces import batches
 from tests.compliance.test_join_infos import INFO
 from tests.support.compare import assert_same

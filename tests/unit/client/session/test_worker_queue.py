@@ -7,8 +7,8 @@ import pytest
 from gymnasium.error import AlreadyPendingCallError
 
 from envhub_sandbox.errors import LocalProtocolError, RemoteProtocolError
+from envhub_sandbox.extras.several_workers.worker_queue import WorkerQueue
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State

@@ -22,39 +22,20 @@ import numpy as np
 from gymnasium.error import NoAsyncCallError
 
 from envhub_sandbox.errors import ActionError, EnvHubError, RemoteEnvWarning, WorkerTimeoutError
+from envhub_sandbox.extras.several_workers.received_infos import gather_infos
+from envhub_sandbox.extras.several_workers.shard_queue import ShardQueue
+from envhub_sandbox.extras.several_workers.worker_queue import WorkerQueue
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.failures import refusal
-from envhub_sandbox.session.parts.received_infos import gather_infos
-from envhub_sandbox.session.parts.shard_queue import ShardQueue
-from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.session.requests import SENT, MessageFor, RequestOrder
 from envhub_sandbox.session.use_lock import FleetUse, all_held
 from envhub_sandbox.transport.deadline import Deadline, deadline_of
 from envhub_sandbox.transport.lane import answered_first
 from envhub_sandbox.transport.results import StepResult
+from envhub_sandbox.vector.send_recv import Received
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES
 from envhub_worker.protocol.spaces import batches
-
-
-class Received(NamedTuple):
-    """Results of ``n`` sub-environments, in the order of their ids.
-
-    Attributes:
-        observations: ``(n, *single_observation_space.shape)``.
-        rewards: float64 ``(n,)``; 0 after a reset.
-        terminations, truncations: bool ``(n,)``; False after a reset.
-        infos: As in ``step``, with ``n`` rows. If workers return different dtypes or shapes for a
-            key, its value is an object array.
-        env_ids: int64 ``(n,)``, ascending.
-    """
-
-    observations: Any
-    rewards: Any
-    terminations: Any
-    truncations: Any
-    infos: dict[Any, Any]
-    env_ids: Any
 
 
 class Rows(NamedTuple):
@@ -205,6 +186,20 @@ class InFlight:
 
     # --- receiving -------------------------------------------------------------------------------
 
+    @contextmanager
+    def held_in_time(self, deadline: Deadline) -> Iterator[None]:
+        """Hold the lock that another thread's ``recv`` may hold; raises as ``recv`` does."""
+        lock, left_s, taken = self._order.use.flight, deadline.left_s(), False
+        try:
+            left_s = threading.TIMEOUT_MAX if left_s is None else min(left_s, threading.TIMEOUT_MAX)
+            taken = lock.acquire(timeout=left_s)
+            if not taken:
+                raise _too_few(deadline)
+            yield
+        finally:
+            if taken:
+                lock.release()
+
     def recv(self, min_ready: int, timeout: float | Deadline | None) -> Received:
         """The results of the first sub-environments that are ready, at most one for each.
         Raises ``NoAsyncCallError``: nothing was sent; ``WorkerTimeoutError``: ``timeout`` passed,
@@ -334,20 +329,6 @@ def _queues_of(parts: Sequence[EnvSession]) -> list[WorkerQueue]:
         return [WorkerQueue(part, part.rows, sliced=bool(others)) for part in parts]
     shards: list[ShardQueue] = []
     return [ShardQueue(part, shard, shards) for shard in range(len(part.bounds))]
-
-
-@contextmanager
-def held_in_time(lock: threading.RLock, deadline: Deadline) -> Iterator[None]:
-    """Hold a lock that another thread's ``recv`` may hold; raises as ``recv`` does."""
-    left_s, taken = deadline.left_s(), False
-    try:
-        taken = lock.acquire(timeout=-1 if left_s is None else min(left_s, threading.TIMEOUT_MAX))
-        if not taken:
-            raise _too_few(deadline)
-        yield
-    finally:
-        if taken:
-            lock.release()
 
 
 def _too_few(deadline: Deadline) -> WorkerTimeoutError:

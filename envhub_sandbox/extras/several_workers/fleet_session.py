@@ -148,9 +148,6 @@ class FleetSession:
                 stack.callback(part.close)
 
 
-AnySession = EnvSession | FleetSession
-
-
 class FleetLifecycle:
     """Combines the states of several parts into one: see ``Lifecycle``."""
 

@@ -12,8 +12,8 @@ from functools import partial
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.extras.several_workers.worker_queue import WorkerQueue
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.session.requests import MessageFor
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.results import Results

@@ -1,0 +1,1 @@
+"""One environment over several workers, each with a jail of its own; ``send`` and ``recv``."""
