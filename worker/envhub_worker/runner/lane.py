@@ -385,7 +385,7 @@ class InfoWriter:
     ) -> None:
         self._reply = reply
         self._start = start
-        self._indices = list(range(count))
+        self._count = count
         self._pack = pack
         self._joined = joined
         self._integers: Sequence[bool] = ()
@@ -424,17 +424,14 @@ class InfoWriter:
         return size
 
     def _write_columns(self, pairs: Pairs) -> bool:
-        if [index for index, _ in pairs] != self._indices:
+        if len(pairs) != self._count:
             return False
-        keys = self._keys
-        if any(list(info) != keys for _, info in pairs):
-            return False
-        columns = list(zip(*[info.values() for _, info in pairs], strict=True))
-        for column, kind in zip(columns, self._types, strict=True):
-            if set(map(type, column)) != {kind}:
+        keys, types = self._keys, self._types
+        for expected, (index, info) in enumerate(pairs):
+            if index != expected or [*info] != keys or [*map(type, info.values())] != types:
                 return False
         try:
-            for row, column in zip(self._rows, columns, strict=True):
+            for row, *column in zip(self._rows, *[info.values() for _, info in pairs], strict=True):
                 row[...] = column
         except OverflowError:  # an integer beyond 64 bit: joining fails of it, or it goes encoded
             return False
@@ -452,7 +449,7 @@ class InfoWriter:
         types = list(map(type, first.values()))
         if (
             columns is None
-            or len(pairs) != len(self._indices)
+            or len(pairs) != self._count
             or len(columns) != 2 * len(first)
             or not all(map(batches.is_scalar, types))
         ):
