@@ -19,8 +19,9 @@ from __future__ import annotations
 import mmap
 import operator
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from time import perf_counter_ns
 from typing import TYPE_CHECKING, Any
 
@@ -61,6 +62,7 @@ _UNKNOWN = -1
 RING = 4
 """The number of slots to lend: for the last two batches, and two that a caller keeps."""
 _SPARE = 0
+_BOOL = np.dtype(np.bool_)
 Wishes = tuple[int, int, int]
 """The slot for the observations, the ns to wait awake afterwards, and the core to run on plus one,
 or 0 for any core."""
@@ -114,7 +116,7 @@ class ShardSlabs:
         self._asks = slabs.words(request)  # the header that we write
         self._tells = slabs.words(reply)  # the header that the runner writes: read each word once
         self.schema: Schema = []  # of the infos that came encoded last
-        self._beside: dict[Any, Any] = {}  # what else these have
+        self._columns = Copies((), (), dict)  # makes infos of these
         # By leaf and dtype: the dtype's code, and the leaf's area in the slab as an array of it.
         self._views: dict[tuple[int, Any], Any] = {}
         self._codes = [_UNKNOWN] * len(layout.actions)  # as they stand in the slab
@@ -255,8 +257,14 @@ class ShardSlabs:
         if isinstance(message, m.Value) and type(message.value) is dict:
             with UNTRUSTED:
                 infos, columns = message.value, columns_of(message.value) or ()
-                self._beside = {k: v for k, v in infos.items() if columns and type(k) is int}
+                beside = {key: value for key, value in infos.items() if type(key) is int}
                 self.schema = [(column, column.view(self._reply, start)) for column in columns]
+                keys = [column.key for column in columns]
+                self._columns = Copies(
+                    [view for _, view in self.schema],
+                    [column.dtype for column in columns],
+                    partial(_infos_of_copies, keys, beside),
+                )
                 known = (column.offset + view.nbytes for column, view in self.schema)
                 self._asks[slabs.KNOWN] = max(known, default=0)
         return kind, message
@@ -321,12 +329,16 @@ class ShardSlabs:
         if self._form is not None and (self._form.has_classes or not restores):
             self._checked_form = self._form
 
+    def prepare(self) -> None:
+        """Make the arrays of infos that come as columns: see ``Copies``."""
+        self._columns.prepare()
+
     def columns(self) -> dict[Any, Any]:
         """The infos that came as columns, copied into new arrays."""
         if not self.schema:
             raise RemoteProtocolError("the worker sent columns before their schema")
-        columns = {column.key: view.astype(column.dtype) for column, view in self.schema}
-        return {**columns, **self._beside}
+        columns: dict[Any, Any] = self._columns.take()
+        return columns
 
     def close(self) -> None:
         """Release the views; the maps go with the last array over them."""
@@ -429,6 +441,44 @@ class LaneShard(ShardSlabs):
         self._runner_bell.close()
         self.bell.close()
         super().close()
+
+
+def _infos_of_copies(
+    keys: Sequence[str], beside: dict[Any, Any], copies: Sequence[Any]
+) -> dict[Any, Any]:
+    return {**dict(zip(keys, copies, strict=True)), **beside}
+
+
+class Copies:
+    """Copies arrays of a slab into new ones, which the caller owns.
+
+    Args:
+        views: The arrays of the slab, booleans as bytes. The copy casts them: viewed as bool, a
+            hostile byte of 2 would be neither True nor False.
+        dtypes: The dtype of each copy.
+        assemble: Makes what the caller gets from the list of copies.
+    """
+
+    def __init__(
+        self, views: Sequence[Any], dtypes: Sequence[Any], assemble: Callable[[list[Any]], Any]
+    ) -> None:
+        self._views, self._assemble = views, assemble
+        self._forms = [(view.shape, dtype) for view, dtype in zip(views, dtypes, strict=True)]
+        self._next: tuple[list[Any], Any] | None = None
+
+    def prepare(self) -> tuple[list[Any], Any]:
+        """Make the next copies, still without content, before somebody waits for them."""
+        if self._next is None:
+            arrays = [np.empty(shape, dtype) for shape, dtype in self._forms]
+            self._next = arrays, self._assemble(arrays)
+        return self._next
+
+    def take(self) -> Any:
+        """The copies, in the caller's form."""
+        (arrays, whole), self._next = self.prepare(), None
+        for index, array in enumerate(arrays):
+            array[...] = self._views[index]
+        return whole
 
 
 class JoinedColumns:
@@ -545,51 +595,35 @@ class ObservationSlab(SlotRing):
         super().__init__(layout.slots, layout.slot_bytes, layout.total_bytes)
         self.layout = layout
         self._assemble = slabs.assembler(space)
-        self._views = [_view(self._slots[_SPARE], leaf) for leaf in layout.leaves]
-        self._flat = len(layout.leaves) == 1 and not layout.leaves[0].path  # one array
-        self._rewards, self._flags = slabs.results(self._memory, layout)
-        self._leaves: list[Any] = []  # arrays for the next batch, and for its results
-        self._results: tuple[Any, ...] = ()
+        self._leaves = Copies(*_readable(self._slots[_SPARE], layout), self._assemble)
+        rewards, flags = slabs.results(self._memory, layout)
+        views = rewards, flags[: layout.count], flags[layout.count :]
+        self._columns = Copies(views, [rewards.dtype, _BOOL, _BOOL], tuple)
         self._unheld = [sys.getrefcount(self._slots[index]) for index in range(len(self._slots))]
 
     def prepare(self) -> None:
-        """Make the arrays that the next batch is copied into."""
-        count = self.layout.count
+        """Make the arrays of the next batch: see ``Copies``."""
         if self.chosen == _SPARE:
-            self._leaves = [np.empty(leaf.shape, leaf.dtype) for leaf in self.layout.leaves]
-        flags = np.empty(2 * count, np.bool_)
-        self._results = flags, np.empty(count), flags[:count], flags[count:]
+            self._leaves.prepare()
+        self._columns.prepare()
 
     def take(self) -> Any:
         """The batch in the chosen slot, in the structure of the space."""
-        if self.chosen != _SPARE:
-            slot = self._slots[self.chosen]
-            return self._assemble([_borrowed(slot, leaf) for leaf in self.layout.leaves])
-        if not self._leaves:
-            self.prepare()
-        leaves, self._leaves = self._leaves, []
-        # cast, not viewed as bool: a hostile byte of 2 would be neither True nor False
-        if self._flat:
-            leaves[0][...] = self._views[0]
-            return leaves[0]
-        for leaf, view in zip(leaves, self._views, strict=True):
-            leaf[...] = view
-        return self._assemble(leaves)
+        if self.chosen == _SPARE:
+            return self._leaves.take()
+        views, dtypes = _readable(self._slots[self.chosen], self.layout)
+        pairs = zip(views, dtypes, strict=True)
+        return self._assemble([view.astype(dtype, copy=False) for view, dtype in pairs])
 
     def results(self) -> tuple[Any, Any, Any]:
         """Copies of rewards (float64), terminations and truncations (bool), ``(num_envs,)``."""
-        if not self._results:
-            self.prepare()
-        (flags, rewards, over, cut), self._results = self._results, ()
-        flags[...] = self._flags  # cast, as above
-        rewards[...] = self._rewards
-        return rewards, over, cut
+        results: tuple[Any, Any, Any] = self._columns.take()
+        return results
 
 
-def _view(slot: Any, leaf: slabs.Leaf) -> Any:
-    return slabs.view(slot, leaf, np.dtype(np.uint8) if leaf.dtype.kind == "b" else None)
-
-
-def _borrowed(slot: mmap.mmap, leaf: slabs.Leaf) -> Any:
-    view = _view(slot, leaf)
-    return view.astype(np.bool_) if leaf.dtype.kind == "b" else view
+def _readable(slot: Any, layout: slabs.ObservationLayout) -> tuple[list[Any], list[Any]]:
+    """Views of the leaves in a slot, of booleans as bytes, and the dtypes that the caller gets."""
+    dtypes = [leaf.dtype for leaf in layout.leaves]
+    readable = [np.dtype(np.uint8) if dtype == _BOOL else dtype for dtype in dtypes]
+    pairs = zip(layout.leaves, readable, strict=True)
+    return [slabs.view(slot, leaf, dtype) for leaf, dtype in pairs], dtypes

@@ -98,6 +98,8 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
         # the shards compute meanwhile, so nobody waits for what follows
         self._plan(slot)
         self.observations.prepare()
+        if len(self.shards) == 1:
+            shard.prepare()
 
     def _plan(self, slot: int) -> None:
         """Plan where the shards write a batch, and how they wait for the request after it."""

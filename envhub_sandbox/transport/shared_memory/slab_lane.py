@@ -172,8 +172,8 @@ class ColumnSteps(SlabLane):
         return observation, rewards, over, cut, self._infos() if self._said else {}
 
     def _infos(self) -> dict[Any, Any]:
-        columns = all(kind == slabs.COLUMNS for kind, _ in self._said)
-        if columns and len(self.shards) > 1 and not self.declared.unjoined:
+        joins = len(self.shards) > 1 and not self.declared.unjoined
+        if joins and all(kind == slabs.COLUMNS for kind, _ in self._said):
             schemas = [shard.schema for shard in self.shards]
             if not self._joined.is_of(schemas):
                 self._joined = JoinedColumns(schemas, self._bounds)
