@@ -49,10 +49,11 @@ with_summary() {
   } >"$CI_WORK/$name.summary"
 }
 
-# processes: for tests that start much and wait for it: twice as many as there are cores, which three
-# processes for two still leave idle for a third of the time. Not beyond eight, as in ./test.
+# processes: for tests that start much and wait for it: three times as many as there are cores, as two
+# for each still leave a quarter of their time idle, and the steps beside have a share of it. Not beyond
+# eight, as in ./test.
 processes() {
-  local wanted=$(($(nproc) * 2))
+  local wanted=$(($(nproc) * 3))
   echo $((wanted < 8 ? wanted : 8))
 }
 
