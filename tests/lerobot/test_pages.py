@@ -65,6 +65,7 @@ FEATURES = {
 POLICY = '{"type": "act"}'
 
 
+@pytest.mark.timeout(900)  # it imports LeRobot, which a loaded machine does slowly
 def test_the_pages_hold(olah: OlahServer, tmp_path: Path) -> None:
     """With LeRobot's own functions, in one process, which has loaded nothing of the Hub after."""
     olah.repository("robots/policy").commit({"config.json": POLICY})

@@ -44,6 +44,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.timeout(900)  # it imports torch, which a loaded machine does slowly
 def test_example_scripts(tmp_path: Path) -> None:
     """Each ends well and prints what it promises. One environment, and vector environments in the
     modes that TorchRL takes, pass its own check; episodes end."""
