@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import os
 import secrets
+import select
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -117,11 +118,14 @@ class WorkerConnection:
         self._link = None if far is None else far.link(self._socket, endpoint)
         self._socket.connect(endpoint)
         self._process_fd = process_fd
-        self._poller = zmq.Poller()
-        self._poller.register(self._socket, zmq.POLLIN)
-        self._poller.register(process_fd, zmq.POLLIN)
+        self._sources: list[Source] = [self._socket, process_fd]
         if self._link is not None:
-            self._poller.register(self._link.monitor, zmq.POLLIN)
+            self._sources.append(self._link.monitor)
+        # Not ``zmq.Poller``, but where there is no other (Windows): before it sleeps, zmq_poll(3)
+        # asks each socket twice, and to be asked takes three system calls.
+        self._poller: Any = getattr(select, "poll", zmq.Poller)()
+        for source in self._sources:
+            self._poller.register(source, zmq.POLLIN)
         # Unanswered requests to another host by id, to be sent again over a new connection: the
         # number of the connection that each went over, and its frames.
         self._sent: dict[int, tuple[int, list[Buffer]]] = {}
@@ -268,7 +272,7 @@ class WorkerConnection:
 
     def sources(self) -> list[Source]:
         """What to poll for input before the next call of ``arrived``, at least twice a second."""
-        return [source for source, _ in self._poller.sockets]
+        return self._sources
 
     def reply_again(self, request_id: int, deadline: Deadline) -> m.Message:
         """The reply, without payload, to a request whose wait was interrupted.
@@ -327,22 +331,27 @@ class WorkerConnection:
         return frames
 
     def _wait(self, request_id: int, deadline: Deadline) -> None:
-        if int(self._socket.getsockopt(_EVENTS)) & _READABLE:
-            return  # often so with several workers; this look costs less than a poll
         while not self._is_readable(request_id, self._wait_ms(deadline)):
             if deadline.passed:
                 raise WorkerTimeoutError("the worker did not answer in time")
 
     def _is_readable(self, request_id: int, wait_ms: int | None) -> bool:
         """Whether a message is there; raises the error if no reply to this request can come."""
-        ready = dict(self._poller.poll(wait_ms))
-        if self._socket in ready:
+        # The socket is asked before and after: its descriptor is readable only until the next call
+        # of any of its functions.
+        if self._has_message():
             return True
-        if self._process_fd in ready:
+        ready = self._poller.poll(wait_ms)
+        if self._has_message():
+            return True
+        if any(fd == self._process_fd for fd, _ in ready):
             raise self._has_ended()
         if self._link is not None and request_id in self._sent:
             self._link.check(self._sent[request_id][0])
         return False
+
+    def _has_message(self) -> bool:
+        return bool(int(self._socket.getsockopt(_EVENTS)) & _READABLE)
 
     def _wait_ms(self, deadline: Deadline) -> int | None:
         left = deadline.left_ms()

@@ -6,10 +6,10 @@ The functions for messages skip work that pyzmq's own do for each frame.
 from __future__ import annotations
 
 import os
+import select
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from time import monotonic
-from typing import Any
 
 import zmq
 
@@ -32,14 +32,17 @@ def _nothing(*_: object) -> None:
 
 
 class Loop:
-    """Calls back when a descriptor or a ZeroMQ socket is ready, until ``stop``.
+    """Calls back when a descriptor is ready or a ZeroMQ socket has messages, until ``stop``.
     ``failed``: called with the error of a callback; it must not raise.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
         self._failed = failed
-        self._poller = zmq.Poller()
-        self._callbacks: dict[Any, Callable[[], None]] = {}  # by descriptor or socket
+        # Not ``zmq.Poller``: before it sleeps, zmq_poll(3) asks each socket twice, and to be asked
+        # takes three system calls.
+        self._poller = select.poll()
+        self._callbacks: dict[int, Callable[[], None]] = {}  # by descriptor
+        self._sockets: list[tuple[zmq.Socket[bytes], Callable[[], None]]] = []
         self._stopped = False
         self._tick: Callable[[], None] = _nothing  # called about once a second
         self._look: Callable[[], int | None] = _nothing  # called before each wait
@@ -53,19 +56,27 @@ class Loop:
         """Call a function before each wait; it returns the wait's milliseconds at most, or None."""
         self._look = callback
 
-    def watch(self, source: Any, callback: Callable[[], None]) -> None:
-        """Call a function when a source is readable."""
-        self._poller.register(source, zmq.POLLIN)
-        self._callbacks[source] = callback
+    def watch(self, fd: int, callback: Callable[[], None]) -> None:
+        """Call a function when a descriptor is readable."""
+        self._poller.register(fd, select.POLLIN)
+        self._callbacks[fd] = callback
 
-    def watch_writes(self, source: Any, wanted: bool) -> None:
-        """Set whether a watched source's function is also called when the source is writable."""
-        self._poller.register(source, zmq.POLLIN | (zmq.POLLOUT if wanted else 0))
+    def watch_messages(self, socket: zmq.Socket[bytes], callback: Callable[[], None]) -> None:
+        """Call a function while a ZeroMQ socket has messages."""
+        # A socket's descriptor is readable from the arrival of a message to the next call of any
+        # function of the socket (zmq_getsockopt(3), ZMQ_FD). So before each sleep the loop also
+        # asks the socket itself.
+        self.watch(socket.fileno(), callback)
+        self._sockets.append((socket, callback))
 
-    def unwatch(self, source: Any) -> None:
-        """Forget a source. Idempotent."""
-        if self._callbacks.pop(source, None) is not None:
-            self._poller.unregister(source)
+    def watch_writes(self, fd: int, wanted: bool) -> None:
+        """Set whether a watched descriptor's function is also called when it is writable."""
+        self._poller.register(fd, select.POLLIN | (select.POLLOUT if wanted else 0))
+
+    def unwatch(self, fd: int) -> None:
+        """Forget a descriptor. Idempotent."""
+        if self._callbacks.pop(fd, None) is not None:
+            self._poller.unregister(fd)
 
     def call_on(self, signals: Mapping[int, Callable[[], None]]) -> None:
         """Call a function at these signals, between two rounds. Only on the main thread."""
@@ -89,8 +100,13 @@ class Loop:
         """Poll and call functions until ``stop``."""
         ticked = monotonic()
         while not self._stopped:
-            for ready, _ in self._poller.poll(self._wait_ms()):
-                callback = self._callbacks.get(ready)
+            wait_ms = self._wait_ms()
+            for socket, read in self._sockets:
+                if has_message(socket):
+                    self._call(read)
+                    wait_ms = 0
+            for fd, _ in self._poller.poll(wait_ms):
+                callback = self._callbacks.get(fd)
                 if callback is not None:
                     self._call(callback)
             if monotonic() - ticked >= _POLL_MS / 1000:

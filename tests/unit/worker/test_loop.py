@@ -1,6 +1,9 @@
 """The server's loop looks before each wait, and sleeps for as long as that permits."""
 
 import os
+import select
+
+import zmq
 
 from envhub_worker.loop import Loop
 
@@ -41,3 +44,29 @@ def test_a_look_that_fails_ends_nothing() -> None:
     loop.look_by(fail)
     loop.run()
     assert [str(one) for one in failures] == ["ours"]
+
+
+def test_a_message_that_the_descriptor_no_longer_shows_is_read_before_the_first_sleep() -> None:
+    """Any call of a socket's functions silences its descriptor, such as the answer to another."""
+    failures: list[Exception] = []
+    loop = Loop(failures.append)
+    looked, heard = list[int](), list[bytes]()
+    with (
+        zmq.Context() as context,
+        context.socket(zmq.PULL) as pull,
+        context.socket(zmq.PUSH) as push,
+    ):
+        pull.bind("inproc://messages")
+        push.connect("inproc://messages")
+        push.send(b"first")
+        assert pull.poll(60_000)
+        assert not select.select([pull.fileno()], [], [], 0)[0]  # silent by now
+
+        def read() -> None:
+            heard.append(pull.recv(zmq.NOBLOCK))
+            loop.stop()
+
+        loop.watch_messages(pull, read)
+        loop.look_by(lambda: looked.append(1))
+        loop.run()
+    assert (heard, looked, failures) == ([b"first"], [1], [])

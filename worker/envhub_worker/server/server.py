@@ -63,7 +63,7 @@ class Server:
         ctypes.CDLL(None).srand(int.from_bytes(os.urandom(4), "little"))
         self._context = zmq.Context()
         self._router = self._listen(endpoint)
-        self._loop.watch(self._router, self._serve_clients)
+        self._loop.watch_messages(self._router, self._serve_clients)
         self._jails = Jails(
             self._loop,
             self.reply,
@@ -140,9 +140,13 @@ class Server:
 
     def _serve_clients(self) -> None:
         for _ in range(_ROUND):
+            try:
+                arrived = self._gate.receive(self._router)
+            except zmq.Again:  # what woke us was no message
+                return
+            self._serve(arrived)
             if not has_message(self._router):
                 return
-            self._serve(self._gate.receive(self._router))
 
     def _serve(self, arrived: Incoming) -> None:
         identity, key, frames, _ = arrived

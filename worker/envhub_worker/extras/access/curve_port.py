@@ -84,7 +84,7 @@ class CurvePort:
         self._zap = router.context.socket(zmq.ROUTER)
         self._zap.setsockopt(zmq.LINGER, 0)
         self._zap.bind(_ENDPOINT)
-        loop.watch(self._zap, partial(self._answer, self._zap))
+        loop.watch(self._zap.fileno(), partial(self._answer, self._zap))
         router.setsockopt(zmq.CURVE_SERVER, 1)
         router.setsockopt(zmq.CURVE_SECRETKEY, keys.secret)
         router.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN)
@@ -147,7 +147,7 @@ class ConnectionLimiter:
         self._wires: dict[int, int] = {}
         self._shut_listener: socket.socket | None = None
         self._monitor = router.get_monitor_socket(_EVENTS)
-        loop.watch(self._monitor, self._drain)
+        loop.watch(self._monitor.fileno(), self._drain)
 
     def _drain(self) -> None:
         while True:
