@@ -24,13 +24,13 @@ class Incoming(NamedTuple):
 
     Attributes:
         key: The key that its sender has proved; empty if the server needs no keys.
-        fd: The descriptor of its connection; -1 if that is not known.
+        header: The ZeroMQ frame that knows its connection, or None.
     """
 
     identity: bytes
     key: bytes
     frames: list[Any]
-    fd: int = -1
+    header: zmq.Frame | None = None
 
 
 Payload = Sequence[bytes]

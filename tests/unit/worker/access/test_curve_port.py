@@ -43,7 +43,9 @@ def test_who_has_gone_before_its_greeting_is_read_holds_no_session(
             assert eventually(lambda: not port.connections.open_wires())
         came = port.receive(router)
         sessions = Sessions()
-        session = sessions.connect(came.identity, came.key, b"one", port.connections.wire(came.fd))
+        session = sessions.connect(
+            came.identity, came.key, b"one", port.connections.wire(came.header)
+        )
         sessions.disconnect(port.connections.open_wires())
         assert bool(session.connections) is not goes
         port.close()

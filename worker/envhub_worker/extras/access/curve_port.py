@@ -19,7 +19,7 @@ import socket
 import stat
 import struct
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 
 import zmq
 
@@ -118,13 +118,13 @@ class CurvePort:
         # From the last frame: libzmq 4.3.4 has no metadata of the first one.
         header = router.recv(zmq.NOBLOCK, copy=False)
         rest = receive(router) if header.more else []
-        key, fd = b"" if self._keys else ANYBODY, -1
-        with contextlib.suppress(zmq.ZMQError, ValueError):
-            fd = int(header.get(zmq.SRCFD))
+        key = ANYBODY
         if self._keys is not None:
-            with contextlib.suppress(zmq.ZMQError, ValueError):
-                key = bytes.fromhex(str(header.get("User-Id")))
-        return Incoming(identity, key, [header.bytes, *rest], fd)
+            try:
+                key = _key(str(header.get("User-Id")))
+            except (zmq.ZMQError, ValueError):
+                key = b""
+        return Incoming(identity, key, [header.bytes, *rest], header)
 
     def close(self) -> None:
         """Close the sockets of the handshakes."""
@@ -170,11 +170,16 @@ class ConnectionLimiter:
         else:
             self._log.say("handshake_failed", why="no key, another server's, or noise")
 
-    def wire(self, fd: int) -> int:
-        """Returns the number of a message's connection; 0 if the connection has ended since.
+    def wire(self, header: zmq.Frame) -> int | None:
+        """Returns the number of a message's connection; 0 if the connection has ended since, None
+        if libzmq does not say which it was.
 
         Unlike a descriptor's number, this number is never reused. No connection has 0.
         """
+        try:
+            fd = int(header.get(zmq.SRCFD))
+        except (zmq.ZMQError, ValueError):
+            return None
         self._drain()  # libzmq says that it has accepted before it hands anything on
         return self._wires.get(fd, 0)
 
@@ -218,6 +223,11 @@ class ConnectionLimiter:
         # In this order: a context does not end while the monitor's other end is open.
         self._router.disable_monitor()
         self._monitor.close()
+
+
+@lru_cache(maxsize=1024)
+def _key(text: str) -> bytes:
+    return bytes.fromhex(text)
 
 
 def _listener(endpoint: str) -> socket.socket | None:

@@ -110,7 +110,8 @@ class RemoteGate(Gate):
         if name != WATCHER and is_new:
             self._drain.refuse_new()
         self._places.for_session(key, name)
-        wire = self._port.connections.wire(arrived.fd) if arrived.fd >= 0 else None
+        header, connections = arrived.header, self._port.connections
+        wire = None if header is None else connections.wire(header)
         session = self.sessions.connect(arrived.identity, key, name, wire)
         if is_new:
             self._events.came(session)
@@ -118,6 +119,12 @@ class RemoteGate(Gate):
     def authorize(self, asker: Asker, request: m.Message, payload: Payload) -> m.Message:
         """Check a request against keys and quotas."""
         self._refuse_unless_authorized(asker.key)
+        if isinstance(request, m.Relay):  # first: most requests are steps
+            self.sessions.used(asker.identity, asker.key, request.jail)
+            self._tally.asked(self._label_of(asker.key), request.operation)
+            size = sum(map(len, payload))
+            self._in_flight.add(asker.key, asker, size, self._rules.quotas.inflight_bytes)
+            return request
         if isinstance(request, (m.OpenJail, m.OfferSnapshot, m.NeedPackages)):
             self._drain.refuse_new()
         if isinstance(request, m.OpenJail):
@@ -126,11 +133,6 @@ class RemoteGate(Gate):
             self._places.for_jail(asker, {"runners": request.runners})
         elif isinstance(request, m.ShareSlabs):
             self._places.for_slabs(asker, request)
-        elif isinstance(request, m.Relay):
-            self.sessions.used(asker.identity, asker.key, request.jail)
-            self._tally.asked(self._label_of(asker.key), request.operation)
-            size = sum(map(len, payload))
-            self._in_flight.add(asker.key, asker, size, self._rules.quotas.inflight_bytes)
         return request
 
     def _name_of(self, key: bytes) -> str | None:

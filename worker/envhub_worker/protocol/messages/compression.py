@@ -28,8 +28,10 @@ def available() -> tuple[str, ...]:
 
 def pack_frames(frames: Sequence[Buffer], compression: str) -> list[Buffer]:
     """Returns the frames to send; unchanged if compression gains nothing."""
+    if all(_size(frame) < SMALLEST for frame in frames):
+        return list(frames)
     block = _lz4() if compression == "lz4" else None
-    if block is None or all(_size(frame) < SMALLEST for frame in frames):
+    if block is None:
         return list(frames)
     packed = [_packed(frame, block) for frame in frames]
     if all(new is None for new in packed):

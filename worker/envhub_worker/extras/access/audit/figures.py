@@ -15,6 +15,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from typing import Any
 
 from envhub_worker import __version__
@@ -59,7 +60,10 @@ class Tally:
     def asked(self, client: str, operation: str) -> None:
         """Count a client's request to its runners."""
         word = operation if operation in OPERATIONS else _OTHER
-        self.requests.setdefault(self._known(client), Counter())[word] += 1
+        if client not in self.requests:  # seldom: it is called for each step
+            client = self._known(client)
+            self.requests.setdefault(client, Counter())
+        self.requests[client][word] += 1
 
     def open(self, client: str) -> None:
         """Count a started jail of a client."""
@@ -237,6 +241,7 @@ class ClientFigures:
         return {client: asdict(share) for client, share in chosen.items()}
 
 
+@lru_cache(maxsize=MAX_CLIENTS)
 def client_name(name: str | None, insecure: bool) -> str:
     """Returns the name of a key's owner in figures, from the operator's list of clients."""
     if name is None:
