@@ -25,10 +25,12 @@ from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.launcher import ExpectedManifest, Launcher, LoadedJail
 from envhub_sandbox.session.prewarm import Prewarm, SuitePrewarm
 from envhub_sandbox.session.recorder import recorder_for
+from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import extras, folders
 from envhub_sandbox.system.folders import cache_root, write_whole_file
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.remote_warnings import SHARED_WARNING
 from envhub_sandbox.transport.shard_trials import ShardTrials
 from envhub_sandbox.transport.values import generator, pickled
 from envhub_sandbox.vector.suites import EnvSuites
@@ -178,8 +180,8 @@ class EnvFactory:
         identity = repository.snapshot, repository.arguments, repository.policy, launcher.runs_on
         key = manifest_key(*identity)
         self._cache = ManifestCache(cache_root() / "manifests", key)
-        if num_workers is None:
-            repository.warnings.note_shared = self._cache.note_shared
+        repository.warnings.note_shared = self._cache.note_shared
+        repository.warnings.chosen = num_workers is not None or len(launchers) > 1
 
     def make(self) -> EnvSuites:
         """Make the environments, from the remembered manifest or by opening a first jail."""
@@ -270,6 +272,8 @@ class EnvFactory:
         workers = min(len(self._launchers), env.num_envs) if env.shardable else 1
         trials = self._cache.shard_trials(self._repository.policy.lane)
         bounds = trials.bounds_for(env, self._num_workers if workers == 1 else workers)
+        if self._num_workers is not None and env.shardable and not trials.may_share(env):
+            self._warn_of_sharing(len(bounds), env.num_envs)
         forget = self._cache.forget
 
         def source(launcher: Launcher, shards: int) -> JailSource:
@@ -300,6 +304,16 @@ class EnvFactory:
         ]
         fleet: EnvSession = fleet_session(parts, recorder)  # it has the same interface
         return fleet
+
+    def _warn_of_sharing(self, processes: int, num_envs: int) -> None:
+        """Warn if asynchronous sub-environments that may not share a process have to."""
+        if processes < num_envs:
+            text = (
+                f"{num_envs} sub-environments share {processes} processes, and were not shown to "
+                "be independent of each other, so they may give other results than with "
+                f"AsyncVectorEnv, where each has one: leave {option_name('num_workers')} out"
+            )
+            self._repository.warnings.collect((SHARED_WARNING, text))
 
 
 def _close_all(shared: SharedJails) -> None:

@@ -101,9 +101,10 @@ def make_env(
             them without a network. See ``docs/authors.md``.
         num_workers: Number of processes for the sub-environments. The default is one. With
             ``use_async_envs`` it is one for each sub-environment, as with ``AsyncVectorEnv``; those
-            that were found to be independent of each other share as many as are fastest. Several
-            places in ``sandbox`` have at least one each. Of ``"ray"`` each has a server of its own,
-            which Ray places.
+            that were found to be independent of each other share as many as are fastest. Another
+            number than these is warned of if results may depend on it. Several places in
+            ``sandbox`` have at least one each. Of ``"ray"`` each has a server of its own, which Ray
+            places.
         min_ready: How many sub-environments ``env.recv`` waits for by default. Each sub-environment
             then has its own worker, or ``num_workers`` workers share them: the sub-environments of
             one worker are stepped together, and so are ready together. ``reset`` and ``step`` work

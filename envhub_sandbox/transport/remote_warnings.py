@@ -27,10 +27,17 @@ from envhub_worker.protocol.text import printable
 
 MOST = 100
 """The most different warnings that are shown of one repository."""
+SHARED_WARNING = "SharedStateWarning"
+"""The category of warnings about processes that sub-environments share."""
 _SHARED = (
     "sub-environments that share a process use {} of it, so they may give other results than with "
     "AsyncVectorEnv, where each has a process. From the next make_env of this commit on each has "
     f"one here too; {option_name('num_workers', '<n_envs>')} gives each one now"
+)
+_CHOSEN = (
+    "sub-environments use {}, which those of one process share. Here "
+    f"{option_name('num_workers')}, {option_name('min_ready')} or several places decide which do, "
+    "so results may be others than with Gymnasium's own class; without these they are not"
 )
 _NO_MORE = (
     "Warning",
@@ -42,11 +49,13 @@ class RemoteWarnings:
     """The warnings of one repository, from any of its processes.
     ``unshown``: the warnings that the caller has not seen yet. Always the same object.
     ``note_shared``: called when sub-environments that share a process are not independent.
+    ``chosen``: whether the caller chose how many processes there are.
     """
 
     def __init__(self) -> None:
         self.unshown: deque[RemoteWarning] = deque()
         self.note_shared: Callable[[], None] | None = None
+        self.chosen = False
         self._known: set[RemoteWarning] = set()  # each is shown once
 
     def take(self, frames: Sequence[Buffer]) -> Sequence[Buffer]:
@@ -56,14 +65,16 @@ class RemoteWarnings:
         warnings, rest = WARNINGS.read(frames)
         for warning in warnings:
             if warning[0] != SHARED_CATEGORY:
-                self._collect(warning)
+                self.collect(warning)
             elif self.note_shared is not None:
                 self.note_shared()
                 self.note_shared = None  # only once: a hostile worker may repeat it
-                self._collect(("SharedStateWarning", _SHARED.format(SHARED_STATE[warning[1]])))
+                text = _CHOSEN if self.chosen else _SHARED
+                self.collect((SHARED_WARNING, text.format(SHARED_STATE[warning[1]])))
         return rest
 
-    def _collect(self, warning: RemoteWarning) -> None:
+    def collect(self, warning: RemoteWarning) -> None:
+        """Have a warning shown, unless it was before."""
         shown = self._known
         if warning in shown or len(shown) > MOST:
             return

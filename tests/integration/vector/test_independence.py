@@ -251,13 +251,27 @@ def test_what_is_shared_later_is_said_once_and_then_separated(repository: Path, 
     assert processes(repository, policy={"lane": lane}) == N_ENVS
 
 
-def test_an_explicit_number_of_processes_holds_and_is_not_watched(repository: Path) -> None:
-    """Nor is a synchronous environment, which shares its process as SyncVectorEnv does."""
-    for given in ({"use_async_envs": True, "num_workers": 1}, {"use_async_envs": False}):
-        with (
-            warnings.catch_warnings(),
-            make_env(repository, N_ENVS, env_kwargs={"kind": "numpy"}, **given) as suites,
-        ):
-            warnings.simplefilter("error")
+@pytest.mark.parametrize(
+    ("kind", "options", "said"),
+    [
+        ("closed over", {"use_async_envs": True, "num_workers": 1}, ["not shown"]),
+        ("numpy", {"use_async_envs": True, "num_workers": 2}, ["not shown", "np.random"]),
+        ("numpy", {"num_workers": 2}, ["np.random"]),
+        ("numpy", {"min_ready": 1}, ["np.random"]),
+        ("numpy", {}, []),
+        ("unseeded", {"use_async_envs": True, "num_workers": 1}, []),
+        ("numpy", {"use_async_envs": True, "num_workers": N_ENVS}, []),
+    ],
+)
+def test_an_explicit_number_of_processes_holds_and_is_said_if_results_may_depend_on_it(
+    repository: Path, kind: str, options: dict[str, Any], said: list[str]
+) -> None:
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        with make_env(repository, N_ENVS, env_kwargs={"kind": kind}, **options) as suites:
             play(suites.env)
-            assert len(inside.bounds(suites.env)) == 1
+            if "num_workers" in options:
+                assert len(inside.bounds(suites.env)) == options["num_workers"]
+    texts = [str(one.message) for one in heard if issubclass(one.category, RemoteEnvWarning)]
+    assert len(texts) == len(said)
+    assert all(words in text for words, text in zip(said, texts, strict=True))

@@ -224,7 +224,7 @@ class Runner:
     def build(self, request: m.Build) -> m.Message:
         """Build a slice of a task."""
         task = self._tasks[request.suite, request.task]
-        watched = task.may_share and request.stop - request.start > 1
+        watched = task.is_unlike_gymnasium(request.stop - request.start)
         shared = SharedState(self._snapshot, self.warned.note_shared) if watched else None
         env = self._envs[request.env] = task.build(request.start, request.stop)
         if shared is not None:

@@ -59,6 +59,13 @@ class Task:
         """Whether sub-environments of an ``AsyncVectorEnv`` may have to share a process."""
         return self.recording is not None and not self.recording.sync and self.num_envs > 1
 
+    def is_unlike_gymnasium(self, count: int) -> bool:
+        """Whether a process has ``count`` sub-environments, and Gymnasium's class another number:
+        ``SyncVectorEnv`` all, ``AsyncVectorEnv`` one.
+        """
+        recording = self.recording
+        return recording is not None and count != (self.num_envs if recording.sync else 1)
+
     @property
     def num_envs(self) -> int:
         """The number of sub-environments."""
