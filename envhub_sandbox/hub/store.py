@@ -147,6 +147,17 @@ def endpoint_of(tree: Path) -> str:
     return str(json.loads((tree.parent / "record.json").read_bytes())["endpoint"])
 
 
+def programs_of(tree: Path) -> frozenset[str] | None:
+    """The executable files of a snapshot, as its host named them, since disks of Windows keep no
+    such mode; None of a folder outside the store.
+    """
+    try:
+        record = json.loads((tree.parent / "record.json").read_bytes())
+    except FileNotFoundError:
+        return None
+    return frozenset(record.get("programs", ()))
+
+
 def is_public(slot: Slot) -> bool:
     """Whether the host gave a stored snapshot without a login once."""
     text = _record_of(slot)

@@ -27,6 +27,7 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.extras.packages.packages import PackageSet
 from envhub_sandbox.extras.packages.request import PackageRequest
+from envhub_sandbox.hub.store import programs_of
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.transport.connection import WorkerConnection
@@ -61,7 +62,8 @@ class Sent(NamedTuple):
 def listing(root: Path) -> tuple[Sent, ...]:
     """Hash every file below a snapshot's root. Raises ``SnapshotError``: one cannot be read."""
     try:
-        return tuple(_sent(root, path) for path in sorted(_files(root)))
+        programs = programs_of(root)
+        return tuple(_sent(root, path, programs) for path in sorted(_files(root)))
     except OSError as error:
         raise SnapshotError(f"the snapshot in {root} cannot be read: {error}") from error
 
@@ -71,14 +73,16 @@ def _files(root: Path) -> Iterator[Path]:
         yield from (Path(folder, name) for name in names)
 
 
-def _sent(root: Path, path: Path) -> Sent:
-    running, size = hashlib.sha256(), 0
+def _sent(root: Path, path: Path, programs: frozenset[str] | None) -> Sent:
+    name, running, size = path.relative_to(root).as_posix(), hashlib.sha256(), 0
     with path.open("rb") as file:
         while piece := file.read(PIECE_BYTES):
             running.update(piece)
             size += len(piece)
         executable = bool(os.fstat(file.fileno()).st_mode & stat.S_IXUSR)
-    return Sent(path.relative_to(root).as_posix(), size, running.digest(), executable)
+    if programs is not None:
+        executable = name in programs
+    return Sent(name, size, running.digest(), executable)
 
 
 def upload(

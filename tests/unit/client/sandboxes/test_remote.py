@@ -179,6 +179,11 @@ def test_a_listing_names_each_file_once(tmp_path: Path) -> None:
     found = remote_repository.listing(tmp_path)
     assert [(one.path, one.size) for one in found] == [("a", 0), ("sub/b", len(large))]
     assert [one.sha256 for one in found] == [hashlib.sha256(x).digest() for x in (b"", large)]
+    assert [one.executable for one in found] == [False, False]
+    # a store on Windows, whose disk has no modes; the record has those of git
+    (tmp_path.parent / "record.json").write_text('{"programs": ["sub/b"]}')
+    assert [one.executable for one in remote_repository.listing(tmp_path)] == [False, True]
+    (tmp_path.parent / "record.json").unlink()
     (tmp_path / "gone").symlink_to("nowhere")
     with pytest.raises(errors.SnapshotError, match="cannot be read"):
         remote_repository.listing(tmp_path)
