@@ -19,7 +19,7 @@ from gymnasium.vector import VectorEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from envhub_sandbox.factory.make_env import make_env
-from envhub_sandbox.vector.single_env import info_of
+from envhub_sandbox.vector.single_env import has_begun_again, info_of
 from envhub_sandbox.vector.sub_environment import metadata_of_one
 from envhub_sandbox.vector.suites import choose, closed_if_it_fails
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
@@ -49,8 +49,7 @@ class SandboxVecEnv(VecEnv):
 
     def __init__(self, vector: VectorEnv[Any, Any, Any]) -> None:
         self.vector: Any = vector
-        mode = getattr(vector.metadata.get("autoreset_mode"), "value", None)
-        self._resets_in_the_same_step = mode == "SameStep"
+        self._mode = vector.metadata.get("autoreset_mode")
         self._apart = vector._apart() if isinstance(vector, SandboxVectorEnv) else None
         self._is_plain = hasattr(vector, "env_fns")  # a Sync- or AsyncVectorEnv, or its proxy
         self._one_for_all = True
@@ -146,7 +145,7 @@ class SandboxVecEnv(VecEnv):
     def _begin_again(self, batch: Any, dones: Any, infos: list[dict[str, Any]]) -> Any:
         """Return the observations after resets of ended episodes; ``infos`` gets their last."""
         ended = [index for index in range(self.num_envs) if dones[index]]
-        if self._resets_in_the_same_step:
+        if all(has_begun_again(self._mode, infos[index]) for index in ended):
             with UNTRUSTED:
                 self._begun(ended, infos)
             return batch

@@ -28,9 +28,7 @@ from envhub_worker.protocol.spaces import batches
 
 _DECLARED = frozenset({"action_space", "observation_space", "metadata", "render_mode"})
 """Attributes that are read without a request; setting one sets it here and in the environment."""
-_OURS = frozenset(
-    {"_apart", "_begun", "_close", "_observations", "_resets_in_the_same_step", "_spec", "_vector"}
-)
+_OURS = frozenset({"_apart", "_begun", "_close", "_mode", "_observations", "_spec", "_vector"})
 _PACKAGE = __name__.partition(".")[0]
 
 
@@ -39,9 +37,9 @@ class SingleEnv(gym.Env[Any, Any]):
 
     A vector environment resets an ended sub-environment by itself; a ``gymnasium.Env`` does not. So
     the runner is told to leave that to ``reset``. A repository's own vector class in the mode
-    ``SAME_STEP`` has begun the next episode already: then ``reset`` without a seed or options
-    returns that first observation and does not reset again, so the number of resets is the number
-    that the caller asked for.
+    ``SAME_STEP``, or that states no mode and returns ``final_obs``, has begun the next episode
+    already: then ``reset`` without a seed or options returns that first observation and does not
+    reset again, so the number of resets is the number that the caller asked for.
 
     Args:
         vector: With ``num_envs`` 1.
@@ -75,8 +73,7 @@ class SingleEnv(gym.Env[Any, Any]):
             metadata=metadata_of_one(vector),
             render_mode=vector.render_mode,
         )
-        mode = getattr(vector.metadata.get("autoreset_mode"), "value", None)
-        self._resets_in_the_same_step = mode == "SameStep"
+        self._mode = vector.metadata.get("autoreset_mode")
 
     @property
     def vector(self) -> VectorEnv[Any, Any, Any]:
@@ -159,7 +156,7 @@ class SingleEnv(gym.Env[Any, Any]):
         [info, *more], scalars, odd = self._own(infos)
         observation = self._first(batch, scalars)
         terminated, truncated = bool(terminations[0]), bool(truncations[0])
-        if (terminated or truncated) and self._resets_in_the_same_step:
+        if (terminated or truncated) and has_begun_again(self._mode, info):
             last, last_info = info.pop("final_obs"), info.pop("final_info", {})
             self._begun = observation, {**info, **(more[0] if more else {})}
             observation, info = batches.restore(self._observations[0], last), last_info
@@ -325,6 +322,13 @@ class SingleEnv(gym.Env[Any, Any]):
             return [{}, {}], (), ()
         [own], scalars, reward = self._apart.own(infos)
         return [*own, {}, {}], scalars, reward
+
+
+def has_begun_again(mode: Any, info: dict[Any, Any]) -> bool:
+    """Whether the step that ended an episode has reset: a class that states no autoreset mode says
+    so by ``final_obs``.
+    """
+    return "final_obs" in info if mode is None else getattr(mode, "value", mode) == "SameStep"
 
 
 def info_of(infos: dict[Any, Any], index: int, num_envs: int) -> dict[Any, Any]:

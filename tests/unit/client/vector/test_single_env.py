@@ -169,6 +169,17 @@ def test_results_that_are_of_nobody_break_the_rules(lies: Any) -> None:
             env.reset()
 
 
+@pytest.mark.parametrize("metadata", [{}, {"autoreset_mode": AutoresetMode.SAME_STEP}], ids=str)
+def test_an_own_class_that_has_begun_again_shows_the_last_observation(metadata: Any) -> None:
+    """Also one that says so by its ``final_obs`` alone; the next reset is the one it has made."""
+    vector = _Liar(terminations=np.ones(1, bool), infos={"final_obs": np.ones(1)})
+    vector.metadata, vector.observation_space = metadata, spaces.MultiDiscrete([2])
+    env = SingleEnv(vector)
+    observation, _, terminated, _, info = env.step(1)
+    assert (observation, terminated, info) == (1, True, {})
+    assert env.reset() == (0, {})
+
+
 @pytest.mark.parametrize(("found", "seed"), [(None, -1), ((None,), -1), ((3,), 3), (3, 3)])
 def test_unknown_seed_is_minus_one(monkeypatch: pytest.MonkeyPatch, found: Any, seed: int) -> None:
     """As ``gymnasium.Env`` has it."""
