@@ -98,9 +98,10 @@ def _batch_of_dicts(
     missing = [key for key in space.spaces if key not in value]
     if missing:
         raise ActionError(f"{name}: {missing} missing; the space is {space}")
-    return {
-        key: batch_of(sub, value[key], count, f"{name}[{key!r}]")
-        for key, sub in space.spaces.items()
+    return {  # in the caller's order, which a repository's own class sees
+        key: batch_of(space[key], item, count, f"{name}[{key!r}]")
+        for key, item in value.items()
+        if key in space.spaces
     }
 
 
