@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import select
 import signal
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -28,7 +27,7 @@ from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import OWN, RECORD, Runtime
 from envhub_worker.spawn.channel import close_fds
 from envhub_worker.spawn.jail import Jail
-from envhub_worker.spawn.zygote_process import ZygoteProcess
+from envhub_worker.spawn.zygote_process import ZygoteProcess, ends_within
 
 _END_S = 8.0
 _LOG_TAIL_BYTES = 8192
@@ -182,9 +181,7 @@ class Spawner:
         code = self._process.wait()
         if self._pidfd >= 0:
             # With namespaces the zygote is a child of the started process, and is killed with it.
-            poller = select.poll()  # of descriptors beyond 1023, too
-            poller.register(self._pidfd, select.POLLIN)
-            poller.poll(_END_S * 1000)
+            ends_within(self._pidfd, _END_S)
             os.close(self._pidfd)
             self._pidfd = -1
         return code

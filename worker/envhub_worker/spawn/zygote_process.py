@@ -9,6 +9,7 @@ package. Then it waits.
 from __future__ import annotations
 
 import os
+import select
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -21,6 +22,15 @@ from envhub_worker.protocol.start_variables import at_start
 from envhub_worker.spawn.channel import Channel
 
 _END_S = 8.0
+
+
+def ends_within(pidfd: int, seconds: float) -> bool:
+    """Wait for the end of a process. ``Popen.wait`` with a timeout sleeps between looks, ever
+    longer.
+    """
+    poller = select.poll()  # of descriptors beyond 1023, too
+    poller.register(pidfd, select.POLLIN)
+    return bool(poller.poll(seconds * 1000))
 
 
 def resolved(runtime: Runtime) -> Runtime:
@@ -85,11 +95,12 @@ class ZygoteProcess:
 
     def wait(self) -> int:
         """Returns the exit code; kills the process if it does not end soon."""
-        try:
-            return self._process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            return self._process.wait()
+        if self._process.poll() is None:
+            pidfd = os.pidfd_open(self.pid)
+            if not ends_within(pidfd, _END_S):
+                self._process.kill()
+            os.close(pidfd)
+        return self._process.wait()
 
     def discard(self) -> None:
         """End the process unused."""

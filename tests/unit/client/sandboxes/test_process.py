@@ -75,11 +75,15 @@ def test_stop_leaves_nothing(server: process.LocalServer) -> None:
         os.close(fd)
 
 
-def test_one_that_does_not_end_is_killed(server: process.LocalServer) -> None:
+def test_one_that_does_not_end_is_killed(
+    server: process.LocalServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its end is waited for, and not looked for now and then, as ``Popen.wait`` would."""
     started = [sys.executable, "-c", DEAF]
     child = subprocess.Popen(started, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     with child.stdin, child.stdout, server.starting(lambda _: child):
         assert child.stdout.read() == b"", "it ignores SIGTERM from now on"
+        monkeypatch.setattr("time.sleep", lambda seconds: pytest.fail("it looks now and then"))
         server.stop()
         assert child.returncode == -signal.SIGKILL
 
