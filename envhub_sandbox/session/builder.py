@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from envhub_sandbox.errors import LoadError, remote_error
 from envhub_sandbox.session.launcher import ExpectedManifest, Launcher, LoadedJail
+from envhub_sandbox.system import extras
 from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import check_reply, typed_reply
@@ -251,10 +252,11 @@ class Builder:
         """
         server = loaded.server
         if server.fd_path is None or self._repository.policy.lane == "frames":
-            from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
-
+            module = "envhub_sandbox.extras.remote.served_lane"
             # the server has room for the slabs of one environment for each runner
-            return (ServedLane.open(relay, deadline) if self._own else None) or relay
+            served = extras.find(module, "ServedLane") if self._own else None
+            lane: Lane | None = served and served.open(relay, deadline)
+            return lane or relay
         # imported late: only Linux has these modules' dependencies
         from envhub_sandbox.transport.shared_memory.attachment import Attachment
         from envhub_sandbox.transport.shared_memory.client_slabs import RING

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Collection, Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
@@ -26,11 +26,17 @@ from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 
-if TYPE_CHECKING:
-    from envhub_sandbox.transport.shared_memory.client_slabs import ObservationSlab
-    from envhub_sandbox.transport.shared_memory.served_lane import ReceivedBatch
-
 STEP = "step"
+
+
+class StepBatch(Protocol):
+    """The results of one step of all shards; each method is called once a step."""
+
+    def take(self) -> Any:
+        """The observations, in the structure of the space."""
+
+    def results(self) -> tuple[Any, Any, Any]:
+        """Rewards (float64), terminations, truncations (bool), ``(num_envs,)``."""
 
 
 class SlabLane(Lane):
@@ -127,9 +133,7 @@ class ColumnSteps(SlabLane):
         rest: Further arguments of the next class in the method resolution order.
     """
 
-    def __init__(
-        self, layout: slabs.Layout, batch: ObservationSlab | ReceivedBatch, relay: Lane, *rest: Any
-    ) -> None:
+    def __init__(self, layout: slabs.Layout, batch: StepBatch, relay: Lane, *rest: Any) -> None:
         super().__init__(relay, *rest)
         self._bounds = self.declared.slices
         self._batch = batch

@@ -17,8 +17,8 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.extras.remote.served_lane import ReceivedBatch, ServedShard
 from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard, ObservationSlab, SlotRing
-from envhub_sandbox.transport.shared_memory.served_lane import ReceivedBatch, ServedShard
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages.forms import IrregularError
 from envhub_worker.protocol.shared_memory import slabs

@@ -21,10 +21,11 @@ import envhub_sandbox as hub
 from envhub_sandbox import errors
 
 repository, asked = sys.argv[1], json.loads(sys.argv[2])
-with hub.make_env(repository, n_envs=2) as envs:
-    env = envs.env
-    env.reset(seed=1)
-    print(env.step(env.action_space.sample())[1].shape)
+for lane in ("auto", "frames"):
+    with hub.make_env(repository, n_envs=2, policy={"lane": lane}) as envs:
+        env = envs.env
+        env.reset(seed=1)
+        print(env.step(env.action_space.sample())[1].shape)
 for argument, value in asked:
     try:
         hub.make_env(**{"cfg": repository, "n_envs": 2, argument: value})
@@ -83,8 +84,8 @@ def test_the_core_needs_no_extra(core: Path) -> None:
     asked = [(argument, value) for argument, value, _, _ in _ASKED]
     asked += [("policy", policy) for _, policy in _OF_WORKER]
     printed = alone(core, _CALLS, sample("cartpole"), json.dumps(asked)).splitlines()
-    shape, *refused = printed[-1 - len(asked) :]
-    assert shape == "(2,)"
+    *shapes, refused = *printed[-len(asked) - 2 : -len(asked)], printed[-len(asked) :]
+    assert shapes == ["(2,)", "(2,)"]
     assert [line.partition(", which this")[0] for line in refused[: len(_ASKED)]] == [
         f"{what} needs envhub_sandbox.extras.{module}" for _, _, what, module in _ASKED
     ]

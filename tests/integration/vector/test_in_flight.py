@@ -15,11 +15,12 @@ import pytest
 from gymnasium.error import ClosedEnvironmentError, NoAsyncCallError
 
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.extras.remote import served_lane
 from envhub_sandbox.extras.several_workers import in_flight, worker_queue
 from envhub_sandbox.session import requests
 from envhub_sandbox.transport import connection
 from envhub_sandbox.transport import lane as relay_lane
-from envhub_sandbox.transport.shared_memory import served_lane, slab_lane
+from envhub_sandbox.transport.shared_memory import slab_lane
 from envhub_worker.protocol.lifecycle import State
 from tests.support import inside
 from tests.support.in_process.interrupts import before_line

@@ -11,9 +11,9 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError
+from envhub_sandbox.extras.remote.served_lane import ServedLane
 from envhub_sandbox.extras.several_workers import worker_queue
 from envhub_sandbox.transport.deadline import Deadline, SpinChooser, StepDeadline
-from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, limits_for
 from envhub_worker.protocol.shared_memory import slabs
 from tests.support import inside

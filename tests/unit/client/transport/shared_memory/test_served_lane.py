@@ -10,12 +10,12 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox import errors
+from envhub_sandbox.extras.remote import served_lane
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.shared_memory import served_lane
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.shared_memory import slabs
