@@ -182,7 +182,7 @@ class ProcessSandbox(Sandbox):
 
 
 def check_platform() -> None:
-    """Raise ``SandboxUnavailableError`` if this platform cannot confine a process."""
+    """Raise ``SandboxUnavailableError`` if this program cannot start a server here."""
     if not IS_LINUX:
         raise SandboxUnavailableError(
             f"{option_name('sandbox', 'process')} needs Linux, and this is {NAME}, where nothing "
@@ -190,6 +190,11 @@ def check_platform() -> None:
             " (build its image once, in a checkout: docker build -t envhub-worker .), or on a "
             "Linux host where 'envhub-worker listen' runs, with "
             f"{option_name('sandbox', 'tcp://HOST:PORT')}"
+        )
+    if not BOOTSTRAP.is_file():
+        raise SandboxUnavailableError(
+            f"{BOOTSTRAP.parent} is no folder (is it in a zip archive?), and a jail's interpreter "
+            "runs the files there. Install envhub-sandbox with pip, and leave it out of the archive"
         )
 
 

@@ -6,10 +6,13 @@ import os
 import stat
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
 
+import envhub_sandbox
+import envhub_worker
 from envhub_sandbox import make_env
 from tests.remote.listening import WORKER, counting, listening
 from tests.support.processes import eventually
@@ -56,6 +59,20 @@ def test_an_environment_runs(tmp_path: Path, umask: str) -> None:
     assert "stepped (1, 4)" in done.stdout, done.stderr
     assert (cache / "manifests").is_dir()
     assert open_to_others(cache) == []
+
+
+def test_from_an_archive_it_says_what_to_do(tmp_path: Path) -> None:
+    """Without the archive the same program runs: the tests above."""
+    archive = tmp_path / "program.pyz"
+    with zipfile.ZipFile(archive, "w") as file:
+        for module in (envhub_sandbox, envhub_worker):
+            package = Path(*module.__path__)
+            for path in package.rglob("*.py"):
+                file.write(path, path.relative_to(package.parent))
+    words = sys.executable, "-c", _RUN, sample("cartpole")
+    done = under("022", *words, PYTHONPATH=str(archive))
+    assert f"SandboxUnavailableError: {archive}/envhub_worker is no folder" in done.stderr
+    assert "leave it out of the archive" in done.stderr
 
 
 @pytest.mark.parametrize("umask", UMASKS)
