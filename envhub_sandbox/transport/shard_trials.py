@@ -19,12 +19,12 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from envhub_sandbox.system.folders import write_whole_file
+from envhub_sandbox.system.platform import own_cpus
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.batches import even_bounds
 
@@ -64,7 +64,7 @@ class ShardTrials:
         self._path = path
         self._apart = apart
         self._noted: Note | None = None
-        self._cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+        self._cores = len(own_cpus())
 
     def bounds_for(self, env: EnvManifest, num_workers: int | None) -> Bounds:
         """The slices of the sub-environments, one for each shard: ``num_workers`` shards if given,

@@ -21,7 +21,7 @@ ENV = environment(16)
 
 
 def cores(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    monkeypatch.setattr(shard_trials.os, "sched_getaffinity", lambda pid: set(range(count)))
+    monkeypatch.setattr(shard_trials, "own_cpus", lambda: list(range(count)))
 
 
 @pytest.fixture(autouse=True)
