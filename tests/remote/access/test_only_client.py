@@ -75,6 +75,7 @@ def test_the_files_of_two_clients_are_apart(tmp_path: Path) -> None:
         (("--only-client", "nonsense"), "hexadecimal"),
         (("--only-client", "00" * 32, "--authorized-clients", "file"), "leave one out"),
         (("--only-client", "00" * 32, "--insecure-loopback"), "has no keys"),
+        (("--authorized-clients", "/nope"), "there is no file /nope. It has a client on each line"),
     ],
 )
 def test_contradictions_are_refused(tmp_path: Path, words: tuple[str, ...], text: str) -> None:

@@ -60,6 +60,11 @@ def identity_of(arguments: argparse.Namespace, state: Path) -> Identity:
         return Identity(pair, client=KeyPair(arguments.only_client, b""))
     pair = keys.load(arguments.key) if arguments.key else _kept_pair(state, "server")[0]
     if arguments.authorized_clients:
+        if not arguments.authorized_clients.exists():
+            raise UsageError(
+                f"--authorized-clients: there is no file {arguments.authorized_clients}. It has a "
+                "client on each line: its public key ('envhub-worker keygen' makes one), and a name"
+            )
         return Identity(pair, arguments.authorized_clients)
     client, fresh = _kept_pair(state, "client")
     return Identity(pair, None, client, state / "client.key", fresh)
