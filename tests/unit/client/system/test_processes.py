@@ -173,6 +173,7 @@ def test_a_program_of_ours_is_this_code_and_need_not_be_installed(tmp_path: Path
     done = subprocess.run(
         [sys.executable, "-c", start],
         env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        cwd="/",  # which goes before the variable, and may be a checkout
         stdout=subprocess.PIPE,
         text=True,
         check=True,
