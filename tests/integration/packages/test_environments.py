@@ -30,7 +30,7 @@ from tests.support.packages.wheels import Index, make_wheel
 from tests.support.processes import eventually
 
 OWN = chosen({}, None)[0]
-CHECKOUT = Path(__file__).resolve().parents[4]
+CHECKOUT = Path(__file__).resolve().parents[3]
 
 
 def repository(folder: Path, *lines: str) -> Path:
@@ -129,7 +129,7 @@ def test_what_lost_its_content_is_made_again(index: Index, tmp_path: Path, damag
 
 MAKER = """\
 import sys
-from tests.unit.client.dependencies.test_environments import made
+from tests.integration.packages.test_environments import made
 from pathlib import Path
 print(made(Path(sys.argv[1])).home, flush=True)
 """
@@ -168,7 +168,7 @@ KILLED = """\
 import sys, time
 from pathlib import Path
 from tests.support import inside
-from tests.unit.client.dependencies.test_environments import made
+from tests.integration.packages.test_environments import made
 
 def stop(*given, **named):
     Path(sys.argv[3]).touch()
