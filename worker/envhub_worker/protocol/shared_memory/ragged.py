@@ -72,8 +72,8 @@ class ArrayArea:
         if self._slot is not None and nbytes > INLINE_BYTES:
             borrowed: Array = np.ndarray(shape, dtype, self._slot, offset)
             return borrowed
-        array: Array = np.ndarray(shape, dtype, self._memory, self._start + offset)
-        return array.copy()
+        array: Array = np.ndarray(shape, dtype, self._memory, self._start + offset).copy()
+        return array
 
 
 class Written:
