@@ -159,7 +159,7 @@ def is_trusted(user: int) -> bool:
 
     The owner of ``/`` is root, as seen in a user namespace. On Windows all users have the number 0.
     """
-    return user in (0, user_id()) or user == os.lstat("/").st_uid
+    return user == 0 or user == user_id() or user == os.lstat("/").st_uid
 
 
 def _is_own_group(path: str, status: os.stat_result) -> bool:
