@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 
+from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.vector.actions import batch_of_one
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.sub_environment import metadata_of_one
@@ -326,9 +327,15 @@ class SingleEnv(gym.Env[Any, Any]):
 
 def has_begun_again(mode: Any, info: dict[Any, Any]) -> bool:
     """Whether the step that ended an episode has reset: a class that states no autoreset mode says
-    so by ``final_obs``.
+    so by ``final_obs``. Raises ``RemoteProtocolError``: the last observation is missing.
     """
-    return "final_obs" in info if mode is None else getattr(mode, "value", mode) == "SameStep"
+    has_last, value = "final_obs" in info, getattr(mode, "value", mode)
+    if value == "SameStep" and not has_last:
+        raise RemoteProtocolError(
+            "its vector class resets in the step that ends an episode (SAME_STEP), and returns no "
+            "final_obs in the infos: the episode's last observation is lost"
+        )
+    return has_last and value in (None, "SameStep")
 
 
 def info_of(infos: dict[Any, Any], index: int, num_envs: int) -> dict[Any, Any]:

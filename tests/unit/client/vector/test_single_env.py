@@ -178,6 +178,10 @@ def test_an_own_class_that_has_begun_again_shows_the_last_observation(metadata: 
     observation, _, terminated, _, info = env.step(1)
     assert (observation, terminated, info) == (1, True, {})
     assert env.reset() == (0, {})
+    vector.said["infos"] = {}
+    if metadata:
+        with pytest.raises(RemoteProtocolError, match="no final_obs"):
+            env.step(1)
 
 
 @pytest.mark.parametrize(("found", "seed"), [(None, -1), ((None,), -1), ((3,), 3), (3, 3)])
