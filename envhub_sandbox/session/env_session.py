@@ -23,13 +23,15 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.session.builder import JailSource
 from envhub_sandbox.session.counters import LEDGER, Counters, Labels
-from envhub_sandbox.session.failures import Failures, Restarts
+from envhub_sandbox.session.failures import Failures, Recovery, Restarts
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import INTERRUPT_S, LOOK_S, Prewarm
 from envhub_sandbox.session.recorder import Recorder, recorder_for
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.requests import Requests
 from envhub_sandbox.session.use_lock import UseLock
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system import extras
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.platform import each_after_fork
 from envhub_sandbox.transport.deadline import Deadline
@@ -82,11 +84,11 @@ class EnvSession:
         self._restarts = Restarts(policy, counters)
         self._failures = failures = Failures(lease, recorder)
         self.use = use = UseLock(lease, failures)
-        recovery = None
+        recovery: Recovery | None = None
         if policy.restart == "transparent":
-            from envhub_sandbox.session.recovery import Recovery  # which few need
-
-            recovery = Recovery(lease, self._restarts, failures, recorder)
+            asked = option_name("restart", policy.restart)
+            made = extras.required("envhub_sandbox.extras.restart.recovery", "Recovery", asked)
+            recovery = made(lease, self._restarts, failures, recorder)
         self.prewarm = Prewarm(lease, use, recorder, recovery)
         self.prewarms = [self.prewarm]
         self.requests = Requests(lease, use, self.prewarm, recorder, failures, recovery)

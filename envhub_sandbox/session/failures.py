@@ -7,6 +7,7 @@ and how soon a dead worker is replaced.
 from __future__ import annotations
 
 import time
+from typing import TYPE_CHECKING, Protocol
 
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.session.counters import Counters
@@ -17,7 +18,12 @@ from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.platform import fork_error_text
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.replies import RunnersDiedError
+from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
+
+if TYPE_CHECKING:
+    from envhub_sandbox.transport.jail import Request
 
 _CALM_S = 60.0
 _LONGEST_S = 30.0
@@ -213,3 +219,25 @@ class Failures:
         loaded = lease.loaded
         of_jail = () if loaded is None else (loaded.manifest, loaded.jail.report)
         lease.repository.keep_crash(error, self._recorder, task, *of_jail)
+
+
+class Recovery(Protocol):
+    """Completes a request although shards have died in it: see ``extras/restart``."""
+
+    def started(self) -> None:
+        """Note that the jail is new."""
+
+    def sent(self, request: Request) -> None:
+        """Note a request that was sent."""
+
+    def answered(self) -> None:
+        """Note that no shard has raised in it."""
+
+    def deaths_of_all(self, error: WorkerError) -> RunnersDiedError:
+        """Treat the end of the jail as the death of all shards."""
+
+    def survive_request(self, deaths: RunnersDiedError) -> list[m.Message]:
+        """The replies to a reset. Raises ``WorkerDiedError``: the request was another."""
+
+    def survive_step(self, deaths: RunnersDiedError) -> list[m.StepDone]:
+        """The replies to a step, with truncated rows for the dead shards."""

@@ -13,9 +13,9 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import chain
-from typing import TYPE_CHECKING
 
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.session.failures import Recovery
 from envhub_sandbox.session.launcher import LoadedJail
 from envhub_sandbox.session.lease import Lease, closed_during
 from envhub_sandbox.session.recorder import Recorder
@@ -23,9 +23,6 @@ from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_worker.protocol.lifecycle import Event, State
-
-if TYPE_CHECKING:
-    from envhub_sandbox.session.recovery import Recovery
 
 LOOK_S = 10.0
 """How long to wait for the server to say whether a jail still lives."""

@@ -26,7 +26,7 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.session.failures import Failures, refusal
+from envhub_sandbox.session.failures import Failures, Recovery, refusal
 from envhub_sandbox.session.lease import AttributeCache, Lease
 from envhub_sandbox.session.prewarm import Prewarm
 from envhub_sandbox.session.recorder import Recorder
@@ -41,7 +41,6 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
 
 if TYPE_CHECKING:
-    from envhub_sandbox.session.recovery import Recovery
     from envhub_sandbox.transport.jail import Request
     from envhub_sandbox.transport.lane import Lane
 

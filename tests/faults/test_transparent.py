@@ -14,7 +14,7 @@ import pytest
 from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import errors, make_env
-from envhub_sandbox.session.recovery import derived_seed
+from envhub_sandbox.extras.restart.recovery import derived_seed
 from envhub_worker.protocol.lifecycle import State
 from tests.faults.endurance.monkey import same
 from tests.faults.mortal import ALL_LIVE, CRASH, EXIT, KILL, LIVE, MEMORY, RAISE, SEED, SPIN, oracle

@@ -42,6 +42,7 @@ _ASKED = [
     ("lock", "pylock.toml", "lock", "packages.source"),
     ("dependencies", {}, "dependencies", "packages.source"),
     ("assets", ["org/data"], "assets", "sources.assets"),
+    ("policy", {"restart": "transparent"}, "policy={'restart': 'transparent'}", "restart.recovery"),
     ("min_ready", 1, "several workers with jails", "several_workers.fleet_session"),
 ]
 """An argument, a value that needs an extra, how the error calls it, and the extra's module."""

@@ -79,6 +79,7 @@ MAY_IMPORT = {
     "envhub_sandbox.extras.packages": {"cli", "extras.sources", "factory", "hub"},
     "envhub_sandbox.extras.ray": {"extras.packages", "extras.remote", "sandboxes", "transport"},
     "envhub_sandbox.extras.remote": {"cli", "extras.packages", "hub", "sandboxes", "transport"},
+    "envhub_sandbox.extras.restart": {"session", "transport"},
     "envhub_sandbox.extras.several_workers": {"session", "transport", "vector"},
     "envhub_sandbox.extras.sources": {"hub"},
     "envhub_sandbox.extras.starter": {"cli"},

@@ -7,7 +7,7 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
-from envhub_sandbox.session.recovery import SeedBook, derived_seed, resets, revived_step
+from envhub_sandbox.extras.restart.recovery import SeedBook, derived_seed, resets, revived_step
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.replies import RunnersDiedError

@@ -1,0 +1,1 @@
+"""Restarts dead workers while an episode goes on: ``restart="transparent"``."""
