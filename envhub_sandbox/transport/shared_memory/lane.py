@@ -76,7 +76,9 @@ class SharedMemoryLane(SlabLane):
         results, manifest = self.declared, self.declared.manifest
         # the other workers of the same environment may be on this machine
         workers = -(-manifest.num_envs // results.count)
-        may_spin = _ORDERED_STORES and workers < len(own_cpus())
+        cores = len(own_cpus())
+        # with more shards than cores, one that waits awake takes its core from others
+        may_spin = _ORDERED_STORES and workers < cores and len(self.shards) <= cores
         self._spin = self._step_spin = SpinChooser(may_spin)  # ``_spin``: that of the last request
         self._talk_spin = SpinChooser(may_spin)  # messages take longer than steps
         self._checked: list[Any] | None = None  # fields of a step that needs no check

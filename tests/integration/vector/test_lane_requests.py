@@ -1,6 +1,7 @@
 """What a lane carries: requests, several steps at once, what is too large; nothing is mixed up."""
 
 import os
+import platform
 import time
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError
 from envhub_sandbox.extras.remote.served_lane import ServedLane
 from envhub_sandbox.extras.several_workers import worker_queue
 from envhub_sandbox.transport.deadline import Deadline, SpinChooser, StepDeadline
+from envhub_sandbox.transport.shared_memory import lane
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, limits_for
 from envhub_worker.protocol.shared_memory import slabs
 from tests.support import inside
@@ -214,6 +216,22 @@ def test_a_single_runner_leaves_the_core_that_its_client_waits_on(
                     assert (every - {core} in seen) == bool(budget_ns)
             finally:
                 os.sched_setaffinity(0, every)
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="elsewhere nobody waits awake")
+@pytest.mark.parametrize("shards", [2, 3])
+def test_nobody_waits_awake_if_shards_outnumber_cores(
+    tmp_path: Path, shards: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shard that waits awake would take its core from those that share it."""
+    begin, allowed = SpinChooser.__init__, list[bool]()
+    monkeypatch.setattr(
+        SpinChooser, "__init__", lambda self, may: (allowed.append(may), begin(self, may))[1]
+    )
+    monkeypatch.setattr(lane, "own_cpus", lambda: [0, 1])
+    folder = write_repository(tmp_path, STILL + _SPACE.replace("SPACE", "Discrete(2)"))
+    with started(folder, shards, use_async_envs=True, num_workers=shards):
+        assert {*allowed} == {shards == 2}
 
 
 _SPACE = """
