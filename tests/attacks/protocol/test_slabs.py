@@ -318,18 +318,19 @@ def test_columns_of_a_step_are_numbers_and_texts_of_its_form(
     """Whatever lies in them; booleans are made such, and all of it is copied."""
     ring, shard = asked
     columns = struct.pack("QQ", slabs.COLUMNS, len(scalars))
-    attack(shard, f"os.pwrite(reply, {columns!r}, {slabs.OUTCOME * 8})")
-    with pytest.raises(RemoteProtocolError, match="impossible answer"):
-        shard.answer()  # they are of no form yet
     flags = np.zeros(2, np.bool_)
     infos = {"log": {"loss": 0.25, "steps": 2}, "name": "walk"}
     step = m.StepDone(np.zeros(2), np.zeros(2), flags, flags, infos)
     packet = _packet(*map(bytes, m.pack(step)))
     os.pwrite(ring.fd, packet, 0)
     digest = StepColumns(m.values_of(step), SLOT).digest
-    offered = struct.pack("QQQ", slabs.DONE, len(packet), digest)
-    attack(shard, f"os.pwrite(reply, {offered!r}, {slabs.OUTCOME * 8})")
-    assert isinstance(shard.answer(), m.StepDone)
+    for offer in (digest + 1, digest):
+        attack(shard, f"os.pwrite(reply, {columns!r}, {slabs.OUTCOME * 8})")
+        with pytest.raises(RemoteProtocolError, match="impossible answer"):
+            shard.answer()  # they are of no form yet; nor of that which the runner alone derives
+        offered = struct.pack("QQQ", slabs.DONE, len(packet), offer)
+        attack(shard, f"os.pwrite(reply, {offered!r}, {slabs.OUTCOME * 8})")
+        assert isinstance(shard.answer(), m.StepDone)
     attack(
         shard,
         f"os.pwrite(observations, b'\x02' * {SLOT}, 0)\n"
