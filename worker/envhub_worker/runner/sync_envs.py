@@ -116,7 +116,8 @@ class Batch:
         self._empty: Any = None  # what batches are made in, where there are no slots
         layout = slabs.observation_layout(space, count, 1)
         if layout is None:
-            self.store: Store = self._keep
+            has_parts = isinstance(space, (spaces.Dict, spaces.Tuple))  # which may not fit
+            self.store: Store = self._keep if has_parts else self._members.__setitem__
             self._empty = create_empty_array(space, n=count, fn=np.zeros)
         else:
             self.write_to([[np.zeros(leaf.shape, leaf.dtype) for leaf in layout.leaves]])
