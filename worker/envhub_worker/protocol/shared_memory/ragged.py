@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from array import array as integers
+from collections import Counter
 from collections.abc import Callable, Sequence
 from itertools import accumulate, chain, islice, pairwise
 from typing import Any
@@ -348,17 +349,18 @@ def _choices(parts: list[tuple[Write, Read]]) -> tuple[Write, Read]:
         numbers, chosen = zip(*members, strict=True) if members else ((), ())
         _write_integers(numbers, written)
         _check(all(0 <= number < len(parts) for number in numbers))
-        for index, (part, _) in enumerate(parts):
-            part([m for number, m in zip(numbers, chosen, strict=True) if number == index], written)
+        members_by_part: list[list[Any]] = [[] for _ in parts]
+        for number, member in zip(numbers, chosen, strict=True):
+            members_by_part[number].append(member)
+        for (part, _), of_part in zip(parts, members_by_part, strict=True):
+            part(of_part, written)
 
     def read(count: int, received: Received) -> list[Any]:
         numbers = _read_integers(count, received)
         if any(not 0 <= number < len(parts) for number in numbers):
             raise RemoteProtocolError("the worker wrote a choice that the space does not have")
-        chosen = [
-            iter(part(sum(number == index for number in numbers), received))
-            for index, (_, part) in enumerate(parts)
-        ]
+        counts = Counter(numbers)  # once: a hostile space may have very many parts
+        chosen = [iter(part(counts[index], received)) for index, (_, part) in enumerate(parts)]
         return [(number, next(chosen[number])) for number in numbers]
 
     return write, read
