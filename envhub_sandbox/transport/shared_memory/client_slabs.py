@@ -307,9 +307,10 @@ class ShardSlabs:
         if columns is None or length > slabs.INFO_BYTES:
             raise RemoteProtocolError("the worker wrote an impossible answer into its slab")
         self._form = columns
-        self.answer_bytes += columns.nbytes + length
         packed = bytes(self._reply[slabs.INFOS : slabs.INFOS + length]) if length else b""
-        return columns.read(*slots.whole, packed, to_tensor, slots.borrowed)
+        values = columns.read(*slots.whole, packed, to_tensor, slots.borrowed)
+        self.answer_bytes += columns.read_bytes + length
+        return values
 
     def checked_step(self) -> list[Any] | None:
         """The fields of a step's answer, if it has columns of a form that ``note_checked`` noted;

@@ -1,5 +1,7 @@
 """Members whose sizes vary, written into a slot and read from it again."""
 
+import mmap
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -45,6 +47,19 @@ def test_members_of_other_sizes_are_columns_of_the_first_ones(space: Any, count:
         read = columns.read(memory, 0, packed, to_tensor)
         memory[:] = bytes(ROOM)
         assert_same(read, [observation, 0.25])
+
+
+def test_a_slot_is_held_by_what_was_read_of_it_alone() -> None:
+    """And the bytes that were read are counted."""
+    columns = StepColumns([((),)], ROOM, spaces.Sequence(spaces.Box(-1, 1, (20_000,))))
+    slot = mmap.mmap(-1, ROOM)
+    packed = columns.write([((np.zeros(20_000, np.float32),) * 2,)], slot, 0)
+    unheld = sys.getrefcount(slot)
+    read = columns.read(slot, 0, packed, to_tensor, slot)
+    assert sys.getrefcount(slot) > unheld
+    assert columns.read_bytes == read[0][0][0].nbytes * 2
+    del read
+    assert sys.getrefcount(slot) == unheld
 
 
 UNFIT: dict[str, Callable[[], Any]] = {

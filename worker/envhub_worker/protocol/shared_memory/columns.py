@@ -52,6 +52,7 @@ class StepColumns:
 
     Attributes:
         nbytes: Bytes of a slot that the arrays of fixed sizes take.
+        read_bytes: Bytes of the slot that the last ``read`` has read.
         digest: Differs if the peer derives other columns; not 0.
         has_classes: Whether members have the classes that Gymnasium gives them (``GraphInstance``).
 
@@ -71,11 +72,13 @@ class StepColumns:
         self._views: dict[int, list[Any]] = {}  # likewise, for writing
         self.has_classes = True
         self._varies = False  # whether it has members of varying sizes
-        self._area: Any = None  # where ``read`` finds arrays of varying sizes
+        # Where ``read`` finds arrays of varying sizes; None afterwards, as it refers to the slot.
+        self._area: Any = None
         try:
             self._fields = [self._observed(space, values[0]), *map(self._part, values[1:])]
         except RecursionError as error:
             raise IrregularError from error
+        self.read_bytes = self.nbytes
         self.digest = 1 + crc32(repr((self._scalars, self._arrays)).encode())
         named = enumerate(name for _, _, _, name in self._arrays)
         self._tensors = [(index, name) for index, name in named if name]
@@ -214,7 +217,10 @@ class StepColumns:
             if type(read) is not list or list(map(type, read)) != self._scalars:
                 raise RemoteProtocolError("the worker wrote other scalars than it had announced")
             scalars = iter(read)
-            return [make(scalars, taken) for _, make in self._fields]
+            values = [make(scalars, taken) for _, make in self._fields]
+        if self._varies:
+            self.read_bytes, self._area = self._area.used, None
+        return values
 
 
 def _members(kind: Any, parts: Sequence[tuple[_Take, _Make]], keys: Any) -> tuple[_Take, _Make]:

@@ -41,15 +41,18 @@ class ArrayArea:
         memory, start, room: The memory of all slots, the offset of this slot, and its size.
         used: Bytes of the slot that other arrays take.
         slot: As for ``StepColumns.read``.
+
+    Attributes:
+        used: Bytes of the slot that arrays take so far.
     """
 
     def __init__(self, memory: Any, start: int, room: int, used: int, slot: Any = None) -> None:
         self._memory, self._start, self._room, self._slot = memory, start, room, slot
-        self._used = used
+        self.used = used
 
     def _next(self, nbytes: int) -> int:
-        offset, self._used = self._used, self._used + -(-nbytes // LINE) * LINE
-        return offset if self._used <= self._room else -1
+        offset, self.used = self.used, self.used + -(-nbytes // LINE) * LINE
+        return offset if self.used <= self._room else -1
 
     def write(self, arrays: Sequence[Array]) -> None:
         """Write arrays. Raises ``IrregularError``: there is no room for all of them."""
