@@ -36,6 +36,7 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture
 def envhub_env(request: pytest.FixtureRequest) -> Iterator[Any]:
     """Make the vector environment of ``--envhub-ref`` in a sandbox, for one test."""
+    __tracebackhide__ = True  # an error shows the repository's code, and none of ours
     ref = request.config.getoption("--envhub-ref")
     if ref is None:
         pytest.fail("the fixture envhub_env needs --envhub-ref REF, as in --envhub-ref .")

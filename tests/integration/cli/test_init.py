@@ -52,6 +52,9 @@ def test_a_new_repository_passes_its_own_tests(tmp_path: Path) -> None:
     done = pytest_run(folder, "--strict-markers", "--envhub-ref", ".")
     assert done.returncode == 0, done.stdout
     assert "3 passed" in done.stdout
+    failing = pytest_run(folder, "test_more.py", "--envhub-ref", "./none")
+    assert "RepositoryUnavailableError" in failing.stdout
+    assert "iter_markers" not in failing.stdout  # the fixture's own source
 
 
 @pytest.mark.parametrize("option", [[], ["--lerobot"]])
