@@ -4,7 +4,6 @@ import ast
 import copy
 import pickle
 import re
-import sys
 from pathlib import Path
 
 import gymnasium
@@ -160,25 +159,6 @@ def test_files_of_the_repository_have_their_names_in_it(tmp_path: Path) -> None:
     assert str(tmp_path) not in failure.traceback
     failure = a_failure(tmp_path, "def make_env(:\n")  # which has no frame in the repository
     assert '  File "env.py", line 1\n    def make_env(:\n                 ^\n' in failure.traceback
-
-
-def test_our_own_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wherever they stand; so are those of the import of the entry file."""
-    source = (
-        "import importlib, sys\n"
-        "from envhub_worker.runner.loader import import_entry\n"
-        f"import_entry({str(tmp_path)!r}, 'other.py', {str(tmp_path)!r})\n"
-    )
-    (tmp_path / "other.py").write_text("1 / 0\n")
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    try:
-        failure = a_failure(tmp_path, source).traceback
-    finally:
-        for name in [name for name in sys.modules if name.split(".")[0] == "hub_env"]:
-            del sys.modules[name]
-    _, *lines = [line.strip() for line in failure.splitlines() if "File" in line]
-    assert lines == ['File "env.py", line 3, in <module>', 'File "other.py", line 1, in <module>']
 
 
 def advised(kind: str, message: str, network: str = "none") -> str:
