@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError
+from gymnasium.error import AlreadyPendingCallError
 
 from envhub_sandbox import make_env
-from envhub_worker.protocol.lifecycle import State
 from tests.support import inside
 from tests.support.samples import SAMPLES
 
@@ -147,26 +146,3 @@ def test_a_second_thread_waits_to_send(
     if asks != "reset":
         received = env.recv() if asks == "send" else found[0]
         assert received.env_ids.tolist() == [0, 1]
-
-
-def test_a_close_in_another_thread_does_not_wait(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also between the halves of a step, which ends with an error then."""
-    errors: list[Exception] = []
-    step = env.step
-
-    def stepped(actions: Any) -> Any:
-        try:
-            return step(actions)
-        except ClosedEnvironmentError as error:
-            errors.append(error)
-            return [np.zeros((2, 4))]
-
-    monkeypatch.setattr(env, "step", stepped)
-    finish = held_between_the_halves(env, monkeypatch)
-    closing = threading.Thread(target=env.close)
-    closing.start()
-    while inside.session(env).lifecycle.state is not State.CLOSED:
-        pass
-    finish()
-    closing.join(DEADLINE_S)
-    assert len(errors) == 1
