@@ -10,7 +10,6 @@ import envhub_sandbox
 from envhub_sandbox import SandboxEnv, make_env
 from envhub_sandbox.errors import EnvHubError, LoadError
 from envhub_worker.protocol.text import MARGIN
-from tests.hub.stub_hub import StubHub
 from tests.support.repositories import write_repository
 
 PACKAGE = str(Path(envhub_sandbox.__file__).parent)
@@ -75,15 +74,6 @@ def test_the_line_in_the_authors_own_folder(tmp_path: Path, at: str, lane: str) 
     place, line = ("make_env", 17) if at == "make_env" else ("step", 13)
     assert f'File "{folder}/env.py", line {line}, in {place}\n' in note
     assert note.count("File ") == 2, note
-
-
-def test_the_line_in_a_repository_of_the_hub(stub_hub: StubHub, hub_cache: Path) -> None:
-    made = stub_hub.add("org/motor", {"env.py": ENV, "parts/motor.py": MOTOR})
-    options = {"endpoint": stub_hub.endpoint, "hub_cache_dir": hub_cache}
-    error = failure("org/motor", at="step", **options)
-    place = f'"parts/motor.py" of org/motor@{made.commit[:12]}, line 2, in turn'
-    assert f"File {place}\n" in str(error)
-    assert str(hub_cache) not in str(error) + vars(error)["__notes__"][0]
 
 
 @pytest.mark.parametrize(("lane", "workers"), [("auto", 1), ("auto", 2), ("frames", 2)])
