@@ -11,7 +11,6 @@ among the scalars, and arrays behind the others (``ragged``).
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -68,7 +67,7 @@ class StepColumns:
         # Of each array: shape, dtype, offset in a slot, and its tensor's dtype by name, or "".
         self._arrays: list[tuple[tuple[int, ...], np.dtype[Any], int, str]] = []
         self.nbytes, self._room, self._parts = 0, room, 0
-        self._copies: dict[int, list[Callable[[], Any]]] = {}  # by the slot's start; for reading
+        self._copies: dict[int, list[ragged.Copy]] = {}  # by the slot's start; for reading
         self._views: dict[int, list[Any]] = {}  # likewise, for writing
         self.has_classes = True
         self._varies = False  # whether it has members of varying sizes
@@ -194,12 +193,15 @@ class StepColumns:
         """
         copies = self._copies.get(start)
         if copies is None:
-            copies = self._copies[start] = [_copier(memory, start, *one) for one in self._arrays]
+            copies = self._copies[start] = [
+                ragged.copier(memory, start + at, shape, dtype)
+                for shape, dtype, at, _ in self._arrays
+            ]
         if slot is None:
             found = [copy() for copy in copies]
         else:
             found = [
-                np.ndarray(shape, dtype, slot, at) if _large(shape, dtype) else copy()
+                np.ndarray(shape, dtype, slot, at) if ragged.is_lent(shape, dtype) else copy()
                 for copy, (shape, dtype, at, _) in zip(copies, self._arrays, strict=True)
             ]
         for index, name in self._tensors:
@@ -281,14 +283,3 @@ def _take_tensor(dtype: np.dtype[Any], shape: tuple[int, ...], value: Any, new: 
 
 def _tensor_type() -> Any:
     return getattr(sys.modules.get("torch"), "Tensor", None)
-
-
-def _copier(memory: Any, start: int, shape: Any, dtype: Any, at: int, _: str) -> Callable[[], Any]:
-    if dtype.kind == "b":  # a hostile byte of 2 would make a boolean that is neither
-        return partial(np.ndarray(shape, np.uint8, memory, start + at).astype, np.bool_)
-    array: arrays.Array = np.ndarray(shape, dtype, memory, start + at)
-    return array.copy
-
-
-def _large(shape: Any, dtype: Any) -> bool:
-    return bool(dtype.kind != "b" and dtype.itemsize * math.prod(shape) > arrays.INLINE_BYTES)

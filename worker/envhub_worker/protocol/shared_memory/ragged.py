@@ -11,6 +11,7 @@ import math
 from array import array as integers
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import accumulate, chain, islice, pairwise
 from typing import Any
 
@@ -32,6 +33,7 @@ _PYTHON_INTS = -1
 _MISSING = -1
 _MOST = INFO_BYTES
 """Items in one batch, each of which becomes an object of its own."""
+Copy = Callable[[], Any]
 
 
 class ArrayArea:
@@ -70,14 +72,24 @@ class ArrayArea:
         offset = self._next(nbytes)
         if offset < 0:
             raise RemoteProtocolError("the worker wrote sizes that are larger than its slot")
-        if dtype.kind == "b":  # a hostile byte of 2 would make a boolean that is neither
-            flags: Array = np.ndarray(shape, np.uint8, self._memory, self._start + offset)
-            return flags.astype(np.bool_)
-        if self._slot is not None and nbytes > INLINE_BYTES:
+        if self._slot is not None and is_lent(shape, dtype):
             borrowed: Array = np.ndarray(shape, dtype, self._slot, offset)
             return borrowed
-        array: Array = np.ndarray(shape, dtype, self._memory, self._start + offset).copy()
+        array: Array = copier(self._memory, self._start + offset, shape, dtype)()
         return array
+
+
+def copier(memory: Any, offset: int, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Copy:
+    """Returns a function that copies an array. Trust: its bytes are input from the worker."""
+    if dtype.kind == "b":  # a hostile byte of 2 would make a boolean that is neither
+        return partial(np.ndarray(shape, np.uint8, memory, offset).astype, np.bool_)
+    array: Array = np.ndarray(shape, dtype, memory, offset)
+    return array.copy
+
+
+def is_lent(shape: tuple[int, ...], dtype: np.dtype[Any]) -> bool:
+    """Whether a caller who borrows a slot gets a view of such an array; else a copy."""
+    return dtype.kind != "b" and dtype.itemsize * math.prod(shape) > INLINE_BYTES
 
 
 class Written:
@@ -114,7 +126,7 @@ class Received:
 
     def texts(self, count: int) -> list[str]:
         """The next texts."""
-        bounds = [*accumulate(sizes(self.numbers(count)), initial=self._letter)]
+        bounds = [*accumulate(_sizes(self.numbers(count)), initial=self._letter)]
         self._letter = bounds[-1]
         return [self._text[start:stop] for start, stop in pairwise(bounds)]
 
@@ -130,7 +142,7 @@ Read = Callable[[int, Received], list[Any]]
 """Reads so many members."""
 
 
-def sizes(numbers: list[int]) -> list[int]:
+def _sizes(numbers: list[int]) -> list[int]:
     """The numbers, if they can be sizes. Trust: input from the worker."""
     if numbers and min(numbers) < 0:
         raise RemoteProtocolError("the worker wrote a negative size")
@@ -160,13 +172,11 @@ def members_of(space: Any, *, stacked: bool = False) -> tuple[Write, Read]:
         return _write_texts, _read_texts
     elif isinstance(space, spaces.Dict) and space.spaces:
         parts = [members_of(part, stacked=stacked) for part in space.spaces.values()]
-        return _fields(parts, dict, list(space.spaces))
+        return _fields(parts, {dict}, keys=list(space.spaces))
     elif isinstance(space, spaces.Tuple) and space.spaces:
-        return _fields([members_of(part, stacked=stacked) for part in space.spaces], tuple, None)
+        return _fields([members_of(part, stacked=stacked) for part in space.spaces], {tuple})
     elif isinstance(space, spaces.Sequence):
-        if space.stack and isinstance(
-            space.feature_space, (*ARRAY_SPACES, spaces.Dict, spaces.Tuple)
-        ):
+        if space.stack and isinstance(space.feature_space, _STACKED):
             return members_of(space.feature_space, stacked=True)
         return _sequences(*members_of(space.feature_space))
     elif isinstance(space, spaces.Graph):
@@ -290,11 +300,13 @@ def _read_texts(count: int, received: Received) -> list[Any]:
     return received.texts(count)
 
 
-def _fields(parts: list[tuple[Write, Read]], kind: type, keys: Any) -> tuple[Write, Read]:
-    """Tuples, or mappings in the order of their space."""
+def _fields(
+    parts: list[tuple[Write, Read]], classes: set[type], make: Any = tuple, keys: Any = None
+) -> tuple[Write, Read]:
+    """Tuples, which ``make`` makes again, or mappings with their ``keys`` in this order."""
 
     def write(members: Sequence[Any], written: Written) -> None:
-        _check(_classes(members) <= {kind})
+        _check(_classes(members) <= classes)
         if keys is not None:
             _check(all(list(member) == keys for member in members))
             members = [member.values() for member in members]
@@ -305,7 +317,7 @@ def _fields(parts: list[tuple[Write, Read]], kind: type, keys: Any) -> tuple[Wri
     def read(count: int, received: Received) -> list[Any]:
         members = zip(*[part(count, received) for _, part in parts], strict=True)
         if keys is None:
-            return list(members)
+            return list(map(make, members))
         return [dict(zip(keys, member, strict=True)) for member in members]
 
     return write, read
@@ -318,7 +330,7 @@ def _sequences(write_items: Write, read_items: Read) -> tuple[Write, Read]:
         write_items([*chain.from_iterable(members)], written)
 
     def read(count: int, received: Received) -> list[Any]:
-        lengths = sizes(received.numbers(count))
+        lengths = _sizes(received.numbers(count))
         items = iter(read_items(sum(lengths), received))
         return [tuple(islice(items, length)) for length in lengths]
 
@@ -331,17 +343,7 @@ def _graphs(space: spaces.Graph) -> tuple[Write, Read]:
     _check(isinstance(space.node_space, ARRAY_SPACES))
     rows = (tuple(space.node_space.shape or ()), edges, links)
     parts = [_arrays(row, optional=True) for row in rows]
-
-    def write(members: Sequence[Any], written: Written) -> None:
-        _check(_classes(members) <= {GraphInstance, tuple})
-        columns = zip(*members, strict=True) if members else ((),) * len(parts)
-        for (part, _), column in zip(parts, columns, strict=True):
-            part(column, written)
-
-    def read(count: int, received: Received) -> list[Any]:
-        return list(map(GraphInstance, *(part(count, received) for _, part in parts)))
-
-    return write, read
+    return _fields(parts, {GraphInstance, tuple}, GraphInstance._make)
 
 
 def _choices(parts: list[tuple[Write, Read]]) -> tuple[Write, Read]:
