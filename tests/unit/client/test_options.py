@@ -54,7 +54,10 @@ MIB = 1 << 20
         ({"env_kwargs": ["a"]}, TypeError, "mapping"),
         ({"env_kwargs": {1: 2}}, TypeError, "mapping"),
         ({"env_kwargs": {"n_envs": 3}}, TypeError, "separate argument"),
-        ({"sandbox": False}, PolicyError, "sandbox is False"),
+        *(
+            ({"sandbox": name}, PolicyError, f"sandbox is {name!r}")
+            for name in (False, "vm", "file:/none", "dns://host:5555")
+        ),
         ({"python": "3.12"}, PolicyError, r"not a program.* dependencies=\{'python': '3.12'\}"),
         ({"policy": {"lane": "fast"}}, PolicyError, "lane"),
         ({"lane": "frames"}, TypeError, r"policy=\{'lane': ...\}"),
