@@ -53,17 +53,6 @@ def _servers() -> set[int]:
     return found
 
 
-def test_it_goes_when_its_time_has_come() -> None:
-    """With none, with the last environment."""
-    used(0)
-    assert not started()
-    used(0.3)
-    assert eventually(lambda: not started())
-    used(600)
-    assert _servers()
-    stop_idle()
-
-
 _TELLING = """
 import os
 
@@ -127,17 +116,6 @@ def test_many_times_open_and_closed_leaves_one_server_and_nothing_else() -> None
     assert eventually(lambda: len(started()) == _ONLY_SERVER)
     stop_idle()
     assert not started()
-
-
-def test_ever_new_policies_do_not_fill_it_with_zygotes(tmp_path: Path) -> None:
-    """Each kind of policy has a warm interpreter; of those without a jail few stay."""
-    for number in range(5):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        used(600, policy={"readable": (str(folder),)})
-    # two that were there already, the last one, and the server
-    assert eventually(lambda: len(started()) <= 1 + 3 * (_ONLY_SERVER - 1))
-    stop_idle()
 
 
 ENDS = {
