@@ -435,6 +435,7 @@ class Batch(gym.vector.VectorEnv):
         infos = {
             "distance": np.arange(n) / (at + 1), "_distance": ~done,
             "log": {"loss": at / 3, "steps": at, "name": "run", "grad": torch.full((2,), at)},
+            "norms": [torch.tensor(at / 3, requires_grad=True), torch.tensor(at / 7)],
             "best": np.float32(at / 7), "own": [at % 2 == 0, Fact(None, np.int16(at)), f"{at}"],
             "time": 0 if steady else np.datetime64(at, "ns"),
         }

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
+from itertools import islice
 from typing import Any
 from zlib import crc32
 
@@ -81,6 +82,11 @@ class StepColumns:
         self.digest = 1 + crc32(repr((self._scalars, self._arrays)).encode())
         named = enumerate(name for _, _, _, name in self._arrays)
         self._tensors = [(index, name) for index, name in named if name]
+        groups: dict[str, list[int]] = {}  # tensors without dimensions, by dtype
+        for index, name in self._tensors:
+            if not self._arrays[index][0]:
+                groups.setdefault(name, []).append(index)
+        self._groups = list(groups.values())
 
     # --- deriving the columns ------------------------------------------------------------------
 
@@ -136,15 +142,9 @@ class StepColumns:
         self._scalars.append(plain)
         if plain not in _PLAIN:  # complex
             raise IrregularError
-
-        def take(value: Any, new: New) -> None:
-            if type(value) is not kind:
-                raise IrregularError
-            new[0].append(value.item() if item else value)
-
         if item:
-            return take, lambda scalars, found: kind(next(scalars))
-        return take, _next_scalar
+            return partial(_take_item, kind), lambda scalars, found: kind(next(scalars))
+        return partial(_take_scalar, kind), _next_scalar
 
     def _leaf(self, value: Any) -> tuple[_Take, _Make]:
         name, array = "", value
@@ -159,8 +159,9 @@ class StepColumns:
         self.nbytes += -(-array.nbytes // LINE) * LINE
         if self.nbytes > self._room:
             raise IrregularError
-        take = partial(_take_tensor if name else _take_array, array.dtype, array.shape)
-        return take, _next_array
+        if name:
+            return partial(_take_tensor, type(value), value.dtype, array.shape), _next_array
+        return partial(_take_array, array.dtype, array.shape), _next_array
 
     # --- writing and reading -------------------------------------------------------------------
 
@@ -172,6 +173,10 @@ class StepColumns:
         new: New = [], [], []
         for (take, _), value in zip(self._fields, values, strict=True):
             take(value, new)
+        for group in self._groups:
+            bits = _bits_of([new[1][index] for index in group])
+            for index, array in zip(group, bits, strict=True):
+                new[1][index] = array
         packed = _packed(new[0]) if new[0] else b""
         if new[2]:
             ragged.ArrayArea(memory, start, self._room, self.nbytes).write(new[2])
@@ -227,15 +232,26 @@ class StepColumns:
 
 def _members(kind: Any, parts: Sequence[tuple[_Take, _Make]], keys: Any) -> tuple[_Take, _Make]:
     takes, makes = [take for take, _ in parts], [make for _, make in parts]
+    simple = bool(parts) and {*makes} == {_next_scalar}
+    kinds = [take.args[0] for take in takes if isinstance(take, partial)] if simple else []
 
     def take(value: Any, new: New) -> None:
         if type(value) is not kind or (list(value) if kind is dict else len(value)) != keys:
             raise IrregularError
+        if simple:
+            items = [*value.values()] if kind is dict else [*value]
+            if [*map(type, items)] != kinds:
+                raise IrregularError
+            new[0].extend(items)
+            return
         for part, item in zip(takes, value.values() if kind is dict else value, strict=True):
             part(item, new)
 
     def make(scalars: Iterator[Any], arrays: Iterator[Any]) -> Any:
-        members = [part(scalars, arrays) for part in makes]
+        if simple:
+            members = [*islice(scalars, len(makes))]
+        else:
+            members = [part(scalars, arrays) for part in makes]
         if kind is dict:
             return dict(zip(keys, members, strict=True))
         return members if kind is list else tuple(members)
@@ -266,19 +282,47 @@ def _take_same(known: Any, value: Any, new: New) -> None:
         raise IrregularError
 
 
+def _take_scalar(kind: Any, value: Any, new: New) -> None:
+    if type(value) is not kind:
+        raise IrregularError
+    new[0].append(value)
+
+
+def _take_item(kind: Any, value: Any, new: New) -> None:
+    if type(value) is not kind:
+        raise IrregularError
+    new[0].append(value.item())
+
+
 def _take_array(dtype: np.dtype[Any], shape: tuple[int, ...], value: Any, new: New) -> None:
     if type(value) is not np.ndarray or value.shape != shape or value.dtype != dtype:
         raise IrregularError
     new[1].append(value)
 
 
-def _take_tensor(dtype: np.dtype[Any], shape: tuple[int, ...], value: Any, new: New) -> None:
-    if type(value) is not _tensor_type():
+def _take_tensor(kind: Any, dtype: Any, shape: tuple[int, ...], value: Any, new: New) -> None:
+    if type(value) is not kind or value.dtype is not dtype or value.shape != shape:
         raise IrregularError
-    name, array = arrays.tensor_bits(value)
-    if name == "bfloat16":
+    new[1].append(_bits(value) if shape else value)  # those without are copied together
+
+
+def _bits_of(tensors: list[Any]) -> list[Any]:
+    """The bits of tensors without dimensions, in one copy from their device."""
+    if len(tensors) > 1:
+        with suppress(RuntimeError):  # each lies on a device of its own
+            stacked = _bits(sys.modules["torch"].stack(tensors))
+            return [stacked[index, ...] for index in range(len(tensors))]
+    return list(map(_bits, tensors))
+
+
+def _bits(tensor: Any) -> Any:
+    try:
+        return tensor.numpy()
+    except (RuntimeError, TypeError):  # the codec knows more ways
+        _, bits = arrays.tensor_bits(tensor)
+    if bits is None:
         raise IrregularError
-    _take_array(dtype, shape, array, new)
+    return bits
 
 
 def _tensor_type() -> Any:
