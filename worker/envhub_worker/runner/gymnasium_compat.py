@@ -116,12 +116,15 @@ def _parts(env: Any, method: str, result: Any, names: tuple[str, ...]) -> Any:
 
 def _column(env: Any, name: str, values: Any, dtype: Any) -> Any:
     """Returns one value per sub-environment: an array; Gymnasium's wrappers take lists, too."""
+    count = env.num_envs
+    if type(values) is np.ndarray and values.dtype.kind in "biuf" and values.shape[:1] == (count,):
+        return values
     if isinstance(values, (list, tuple)):
         try:
             values = np.asarray(values, None if name == "rewards" else dtype)
         except ValueError:
             values = np.empty(0, object)
-    shape, count = getattr(values, "shape", None), env.num_envs
+    shape = getattr(values, "shape", None)
     kind = getattr(getattr(values, "dtype", None), "kind", "f")
     # Others arrive as texts: a masked array, and what is an array for numpy alone. Arrays of numpy
     # before 1.22 have no ``__dlpack__``.

@@ -451,6 +451,8 @@ def is_scalar(kind: type) -> bool:
 
 def restores(space: gym.Space[Any]) -> bool:
     """Whether members of the space lose their class on the wire (``GraphInstance``)."""
+    if type(space) in ARRAY_SPACES:
+        return False
     if isinstance(space, spaces.Graph):
         return True
     if isinstance(space, spaces.Dict):
