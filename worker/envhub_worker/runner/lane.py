@@ -238,8 +238,11 @@ class Lane:
         derived, columns = self._columns
         values = m.values_of(reply)
         if columns is not None and self._asked[slabs.DERIVED] == derived:
-            with contextlib.suppress(IrregularError):
+            try:
                 packed = columns.write(values, self._observations, self._slot)
+            except IrregularError:
+                pass
+            else:
                 self._scalars = self._put(packed) if packed else 0
                 self._missed, self._offers_at = 0, 2
                 return True

@@ -113,6 +113,7 @@ class Batch:
         self._slots: list[tuple[list[Any], Store, list[Any]]] = []  # leaves, their writer, and rows
         self._slot = 0  # which of them is written now
         self._left: int | None = None  # a slot whose rows the next one begins with
+        self._join: Any = concatenate.dispatch(type(space))  # its function for this space
         self._empty: Any = None  # what batches are made in, where there are no slots
         layout = slabs.observation_layout(space, count, 1)
         if layout is None:
@@ -160,7 +161,7 @@ class Batch:
         """Returns the batched observation: views of arrays that the next step overwrites."""
         if self._slots:
             return slabs.assembler(self._space)(self._slots[self._slot][0])
-        return concatenate(self._space, self._members, self._empty)
+        return self._join(self._space, self._members, self._empty)
 
     def members(self) -> list[Any]:
         """Returns each sub-environment's observation."""

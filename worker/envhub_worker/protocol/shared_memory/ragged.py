@@ -107,7 +107,7 @@ class Received:
     """
 
     def __init__(self, numbers: bytes, text: str, arrays: ArrayArea) -> None:
-        self._numbers: list[int] = np.frombuffer(numbers, np.int64).tolist()
+        self._numbers: list[int] = memoryview(numbers).cast("q").tolist()
         self._text, self._arrays = text, arrays
         self._next = self._letter = 0
 
