@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
+from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import errors
 from envhub_sandbox.session.env_session import EnvSession
@@ -82,19 +82,17 @@ def test_a_late_reply_is_refused_until_a_reset(session: EnvSession, lane: FakeLa
         session.requests.submit_step(ACTIONS)
     session.recover()
     assert session.lifecycle.state is State.READY
+    lane.fails = KeyboardInterrupt()
+    with pytest.raises(KeyboardInterrupt):
+        session.requests.ask("render", render)
+    with pytest.raises(errors.WorkerTimeoutError, match="the last render was interrupted"):
+        session.requests.submit_step(ACTIONS)
 
 
-def test_the_order_is_gymnasiums(session: EnvSession) -> None:
-    requests = session.requests
-    with pytest.raises(NoAsyncCallError, match="`step_wait` without any prior"):
-        requests.end_wait("step")
-    requests.waiting = "reset"
-    with pytest.raises(AlreadyPendingCallError, match="pending call to `reset`"):
-        requests.ask("render", render)
-    requests.end_wait("reset")
-    requests.closed, requests.face = True, "Env"
+def test_a_request_after_close_is_refused(session: EnvSession) -> None:
+    session.requests.closed, session.requests.face = True, "Env"
     with pytest.raises(ClosedEnvironmentError, match="`Env`, after a call to `close"):
-        requests.ask("render", render)
+        session.requests.ask("render", render)
 
 
 def test_a_close_by_a_signal_in_a_wait_says_closed(session: EnvSession, lane: FakeLane) -> None:
