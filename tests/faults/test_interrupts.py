@@ -231,29 +231,6 @@ def test_close_waits_no_longer_than_it_may(
         inside.clean_up(suites.env)
 
 
-@pytest.mark.parametrize("moment", ["built", "started"])
-def test_a_jail_that_comes_up_after_close_is_given_back(
-    moment: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The thread that closes does not wait for it: the one that opened it gives it back."""
-    monkeypatch.setattr(*inside.CLOSE_PATIENCE, 0.0)
-    with make_env(sample("faulty"), env_kwargs={"tasks": 2}) as suites:
-        suites["suite"][0].reset()
-        env = suites["suite"][1]
-        assert inside.state(env) is State.IDLE
-        taken: list[Any] = []
-        owner, name = inside.taking(env)
-        take = getattr(owner, name)
-        monkeypatch.setattr(owner, name, lambda deadline: taken.append(take(deadline)) or taken[-1])
-        owner, name = (inside.building if moment == "built" else inside.started)(env)
-        coming = Inside(getattr(owner, name))
-        monkeypatch.setattr(owner, name, coming)
-        close_during_reset(env, coming)
-        assert taken
-        assert all(loaded.closed for loaded in taken)
-        assert inside.lane(env) is None
-
-
 class Closing(Lifecycle):
     """Closes the environment at a move, in the same thread, as a signal handler does."""
 
@@ -300,22 +277,3 @@ def test_closed_in_the_midst_says_closed(operation: str, lane: str, before: bool
             ask(env)
         assert loaded.closed
         assert (inside.loaded(env), inside.lane(env)) == (None, None)
-
-
-@lanes
-def test_what_was_interrupted_is_said(lane: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a notebook the next cell names what the stopped one did; a late reply is named as late."""
-    with begun(lane) as env:
-        lane_in_use = inside.session(env).lease.lane
-        with monkeypatch.context() as patch:
-            patch.setattr(lane_in_use, "wait", interrupted)
-            with pytest.raises(KeyboardInterrupt):
-                env.step([0, 0])
-        with pytest.raises(errors.WorkerTimeoutError, match="the last step was interrupted"):
-            env.render()
-        env.reset()
-        env.step_async([0, 1])
-        with pytest.raises(errors.WorkerTimeoutError, match="has not finished"):
-            env.step_wait(timeout=0.05)
-        with pytest.raises(errors.WorkerTimeoutError, match="is late"):
-            env.step([0, 0])

@@ -341,19 +341,6 @@ CONTAINER_STARTS: Spot = (container.RepositoryContainer, "_start")
 """What starts one."""
 
 
-def building(env: Any) -> Spot:
-    """Where it is built in a jail."""
-    return session(env).lease._builder, "build"
-
-
-def taking(env: Any) -> Spot:
-    return session(env).lease._jails, "take"
-
-
-def started(env: Any) -> Spot:
-    return session(env).recorder, "started"
-
-
 def ending(env: Any) -> Spot:
     return session(env).lease._jails, "end"
 
