@@ -16,6 +16,7 @@ from envhub_sandbox.errors import (
     RemoteProtocolError,
     WorkerDiedError,
     WorkerError,
+    WorkerTimeoutError,
 )
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
@@ -37,7 +38,7 @@ from envhub_worker.protocol.messages.prefix import CHANGES, WATCHED_TYPES, Attri
 _CAUSE_S = 10.0
 _CAUSE_POLL_S = 0.01
 _UNSEEN_S = 5.0
-"""How long a Ctrl-C during ``open_jail`` waits for the number of the jail, to end it."""
+"""How long ``open_jail``, interrupted or late, waits for the jail's number, to end it."""
 
 
 Frames = list[Buffer]
@@ -349,10 +350,9 @@ def open_jail(
         # Keeps it alive from now on: a server on another host ends a jail that no client holds.
         client.hold(opened.jail)
         return JailHandle(client, opened.jail, runners, report, limits)
-    except EnvHubError:
-        raise
-    except BaseException:  # interruption.md, rule 6
-        _end_unseen(client, sent)
+    except BaseException as error:  # interruption.md, rule 6
+        if isinstance(error, WorkerTimeoutError) or not isinstance(error, EnvHubError):
+            _end_unseen(client, sent)
         raise
 
 

@@ -7,9 +7,9 @@ from unittest.mock import Mock
 
 import pytest
 
-from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.errors import EnvHubError, WorkerTimeoutError
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import JailHandle, WatchedAttributes
+from envhub_sandbox.transport.jail import JailHandle, WatchedAttributes, open_jail
 from envhub_sandbox.transport.lane import Lane, answered_first
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
@@ -18,6 +18,17 @@ from tests.support.in_process.fake_lane import FakeLane
 from tests.support.in_process.fake_server import FakeServer
 
 REPLY = m.pack(m.Value(1))
+
+
+@pytest.mark.parametrize("ends", [WorkerTimeoutError("the deadline came"), KeyboardInterrupt()])
+def test_a_jail_that_opens_too_late_is_ended(ends: BaseException) -> None:
+    """The server opens it after nobody waits for it; without its number nobody could end it."""
+    client = Mock(receive=Mock(side_effect=ends))
+    client.reply_again.return_value = m.JailOpened(7, (0,), ())
+    order = m.OpenJail("a", "b", "c", "d", "e", {}, 1)
+    with pytest.raises(type(ends)):
+        open_jail(client, order, DEFAULT_LIMITS, Deadline(None))
+    assert client.request.call_args.args == (m.CloseJail(7),)
 
 
 def test_what_has_changed_is_no_longer_known() -> None:
