@@ -42,6 +42,7 @@ from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest, decode_manifest
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.stream import StreamReader, pack_packet
+from envhub_worker.protocol.text import counted
 
 SharedJails = dict[Launcher, SharedJail]
 
@@ -309,9 +310,10 @@ class EnvFactory:
         """Warn if asynchronous sub-environments that may not share a process have to."""
         if processes < num_envs:
             text = (
-                f"{num_envs} sub-environments share {processes} processes, and were not shown to "
-                "be independent of each other, so they may give other results than with "
-                f"AsyncVectorEnv, where each has one: leave {option_name('num_workers')} out"
+                f"{num_envs} sub-environments share {counted(processes, 'process', 'processes')}, "
+                "and were not shown to be independent of each other, so they may give other "
+                "results than with AsyncVectorEnv, where each has one: leave "
+                f"{option_name('num_workers')} out"
             )
             self._repository.warnings.collect((SHARED_WARNING, text))
 
