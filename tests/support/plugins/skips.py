@@ -1,4 +1,6 @@
-"""A pytest plugin: what could not be tested, in one line for each reason; in CI that is failed."""
+"""A pytest plugin: names each failure as it happens, and at the end what could not be tested, in
+one line for each reason; in CI that is failed.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +33,12 @@ def pytest_make_collect_report() -> Iterator[None]:
     """In CI a skipped module is a failed one."""
     report = yield
     return _no_skips(report)
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Name a failure at once: a run that is killed prints no summary."""
+    if report.failed and "PYTEST_XDIST_WORKER" not in os.environ:
+        print(f"\nfailed now: {report.nodeid}", flush=True)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

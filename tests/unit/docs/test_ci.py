@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.extras.sources import toml
+from tests.support.plugins import skips
 from tests.support.repositories import write_repository
 
 _RECORDS = """#!/bin/sh
@@ -290,12 +291,17 @@ def test_always(number): assert runs(f"always{number}") == 0
 
 @pytest.mark.parametrize(("others", "runs"), [(0, 4), (20, 1)])
 def test_failures_run_alone_thrice(checkout: Path, tmp_path: Path, others: int, runs: int) -> None:
-    """What fails once more fails the run, and more than twenty are not run again."""
+    """What fails once more fails the run, and more than twenty are not run again. Each failure is
+    named when it happens, not only after the last test."""
     (tmp_path / "test_it.py").write_text(_FAILS % others)
     # only the plugin that is named: each of these processes would load all that are installed
     pytest_again = f"bash {checkout}/.ci/again.sh {sys.executable} -m pytest -q -p xdist.plugin"
-    done = run(pytest_again, tmp_path, PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")
+    pytest_again += f" -p {skips.__name__}"
+    env = {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONPATH": str(checkout)}
+    done = run(pytest_again, tmp_path, **env)
     assert done.returncode == 1
+    at_once = done.stdout.partition("= FAILURES =")[0]
+    assert at_once.count("failed now: ") == 2 + others
     ran = [len((tmp_path / name).read_text()) for name in ("first", "fourth")]
     assert ran == [runs, runs]
     if others:
