@@ -127,7 +127,7 @@ class _Run:
         """Run and print the results, also those before an error; then raise the error."""
         try:
             if self.video is not None:
-                from envhub_sandbox.play.plays import check_target
+                from envhub_sandbox.play.video import check_target
 
                 check_target(self.video)
             with ProgressBar(quiet=self.as_json) as bar, says_what_is_seen(), self.make.explained():
@@ -160,7 +160,7 @@ class _Run:
         self, bar: ProgressBar, suite: str, task: int | str, env: Any, video: Path | None
     ) -> TaskResult:
         from envhub_sandbox.play.episodes import autoreset_mode, rollout
-        from envhub_sandbox.play.plays import fps_of, frame_of, video_writer
+        from envhub_sandbox.play.video import fps_of, frame_of, video_writer
 
         add: Callable[[Any], None] | None = None
 

@@ -17,14 +17,13 @@ import pytest
 import zmq
 
 from envhub_sandbox.extras.docker import container
-from envhub_sandbox.extras.judge import static
+from envhub_sandbox.extras.judge import denials, static
 from envhub_sandbox.extras.judge.play import task, traces
 from envhub_sandbox.extras.packages import environments, interpreters, modules, source
 from envhub_sandbox.extras.packages.resolution import resolutions
 from envhub_sandbox.extras.remote import sandbox as remote
 from envhub_sandbox.extras.remote import tcp
 from envhub_sandbox.factory import make_env
-from envhub_sandbox.play import confinement
 from envhub_sandbox.session import env_session
 from envhub_sandbox.session import launcher as launcher_module
 from envhub_sandbox.session.counters import Ledger
@@ -249,7 +248,7 @@ def _running(env: Any) -> LoadedJail:
     return found
 
 
-HARMLESS_DENIALS = confinement._HARMLESS
+HARMLESS_DENIALS = denials._HARMLESS
 """What a recorded jail is denied that is no attempt of the repository's."""
 PATIENCE_FOR_AN_END: Spot = (task, "_EPISODE_S")
 """Seconds in which the judge looks for the end of an episode."""

@@ -12,8 +12,8 @@ from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, RemoteEnvError, WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.extras.judge.checks import CHECKS, CURES, Check, Severity
+from envhub_sandbox.extras.judge.play.film import Play
 from envhub_sandbox.play.confinement import Confinement
-from envhub_sandbox.play.plays import Play
 from envhub_worker.protocol.text import counted, duration_text, first_of, printable
 
 _RETURNED = re.compile(

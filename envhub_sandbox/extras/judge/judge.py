@@ -29,6 +29,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.extras.judge.checks import CHECKS
+from envhub_sandbox.extras.judge.denials import denial_findings
 from envhub_sandbox.extras.judge.findings import Report
 from envhub_sandbox.extras.judge.play.members import OutsideSpaceError
 from envhub_sandbox.extras.judge.play.task import TaskJudge
@@ -42,7 +43,7 @@ from envhub_sandbox.extras.sources import parsing
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
-from envhub_sandbox.play.confinement import Confinement, denial_findings
+from envhub_sandbox.play.confinement import Confinement
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import policy_from
 from envhub_sandbox.vector.suites import EnvSuites

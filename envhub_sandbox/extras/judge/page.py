@@ -26,7 +26,7 @@ from envhub_sandbox.extras.judge.markup import (
     table,
     text,
 )
-from envhub_sandbox.play.plays import Film, Play
+from envhub_sandbox.extras.judge.play.film import Film, Play
 from envhub_worker.protocol.text import counted, duration_text, size_text
 
 _MOST_PAIRS, _LONGEST_WORD = 1_000, 160

@@ -5,9 +5,9 @@ from html.parser import HTMLParser
 import numpy as np
 
 from envhub_sandbox.extras.judge.findings import Finding, Report
+from envhub_sandbox.extras.judge.play.film import Film, Play
 from envhub_sandbox.play.confinement import Confinement
 from envhub_sandbox.play.episodes import Episode
-from envhub_sandbox.play.plays import Film, Play
 from envhub_sandbox.vector.pictures import png
 
 FRAME = np.full((4, 6, 3), 200, np.uint8)

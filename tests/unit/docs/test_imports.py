@@ -35,7 +35,7 @@ OPTIONAL = {
     "envhub_sandbox.extras.ray.actor": {"ray"},
     "envhub_sandbox.extras.ray.cluster": {"ray"},
     "envhub_sandbox.transport.values": {"torch"},
-    "envhub_sandbox.play.plays": {"imageio_ffmpeg"},
+    "envhub_sandbox.play.video": {"imageio_ffmpeg"},
     "envhub_sandbox.integrations.pytest_plugin": {"pytest"},
 }
 DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "shelve"}

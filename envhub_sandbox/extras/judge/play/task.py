@@ -17,9 +17,9 @@ from gymnasium.error import CustomSpaceError
 from envhub_sandbox.errors import EnvHubError, LoadError, RemoteEnvError, RemoteEnvWarning
 from envhub_sandbox.extras.judge.findings import Report
 from envhub_sandbox.extras.judge.play import probes, traces
+from envhub_sandbox.extras.judge.play.film import Play, facts_of, film
 from envhub_sandbox.extras.judge.play.traces import Env, Trace
 from envhub_sandbox.extras.judge.settings import JudgeOptions
-from envhub_sandbox.play.plays import Play, facts_of, film
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.manifest.names import CONVERTED

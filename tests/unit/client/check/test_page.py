@@ -8,7 +8,7 @@ import pytest
 
 from envhub_sandbox.extras.judge.findings import Report
 from envhub_sandbox.extras.judge.page import page
-from envhub_sandbox.play.plays import Film, Play
+from envhub_sandbox.extras.judge.play.film import Film, Play
 from envhub_sandbox.vector.pictures import png
 from envhub_worker.protocol.text import printable
 from tests.support.output.pages import FRAME, HOSTILE, Page, report_of

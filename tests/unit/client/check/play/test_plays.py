@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from envhub_sandbox.errors import RemoteEnvError
+from envhub_sandbox.extras.judge.play import film as films
 from envhub_sandbox.extras.judge.play import traces
-from envhub_sandbox.play import plays
-from envhub_sandbox.play.plays import Play, facts_of, film
+from envhub_sandbox.extras.judge.play.film import Play, facts_of, film
 
 pytest.importorskip("imageio_ffmpeg")
 Modes = gym.vector.AutoresetMode
@@ -62,7 +62,7 @@ def test_a_film_does_not_take_long() -> None:
 
 
 def test_there_are_pictures_where_nothing_makes_a_film(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plays, "can_encode", lambda: False)
+    monkeypatch.setattr(films, "can_encode", lambda: False)
     made = film(walks(), seed=0, seconds=600)
     assert (len(made.stills), made.video) == (4, b"")
     assert "envhub-sandbox[video]" in made.lacks

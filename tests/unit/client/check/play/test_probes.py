@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
+from envhub_sandbox.extras.judge.denials import denial_findings
 from envhub_sandbox.extras.judge.play import probes
 from envhub_sandbox.extras.judge.play.probes import lerobot_lacks, other_modes, wrong_frames
-from envhub_sandbox.play.confinement import denial_findings
 
 _MIB = 1 << 20
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from envhub_sandbox.errors import RemoteEnvError, VideoError
-from envhub_sandbox.play import plays
+from envhub_sandbox.play import video
 from envhub_sandbox.vector.pictures import png, small_picture
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
@@ -25,12 +25,12 @@ def frame(height: int = 4, width: int = 6, value: int = 7) -> Any:
     "rendered", [(frame(), frame(2, 2)), [frame()], np.stack([frame(), frame(value=9)]), frame()]
 )
 def test_the_first_sub_environment_is_taken(rendered: Any) -> None:
-    assert np.array_equal(plays.first_frame(rendered, "rgb_array"), frame())
+    assert np.array_equal(video.first_frame(rendered, "rgb_array"), frame())
 
 
 def test_odd_sides_repeat_their_last_line() -> None:
     picture = np.arange(5 * 3 * 3, dtype=np.uint8).reshape(5, 3, 3)
-    padded = plays.first_frame((picture,), "rgb_array")
+    padded = video.first_frame((picture,), "rgb_array")
     assert padded.shape == (6, 4, 3)
     assert np.array_equal(padded[:5, :3], picture)
     assert np.array_equal(padded[5, :3], picture[4])
@@ -43,7 +43,7 @@ def test_odd_sides_repeat_their_last_line() -> None:
         (np.zeros((4, 6, 4), np.uint8), r"\(4, 6, 4\)"),
         (np.zeros((4, 6), np.uint8), r"\(4, 6\)"),
         (np.zeros((0, 6, 3), np.uint8), "6x0"),
-        (np.broadcast_to(np.uint8(0), (2, plays.MAX_SIDE + 1, 3)), f"{plays.MAX_SIDE + 1}x2"),
+        (np.broadcast_to(np.uint8(0), (2, video.MAX_SIDE + 1, 3)), f"{video.MAX_SIDE + 1}x2"),
         ("a text", "a str"),
         (np.zeros((4, 4, 3), object), "object"),
         (np.lib.stride_tricks.as_strided(np.zeros(1, np.uint8), (10**5, 10**5, 3), (0,) * 3), "x"),
@@ -52,18 +52,18 @@ def test_odd_sides_repeat_their_last_line() -> None:
 )
 def test_what_is_no_frame_is_refused(rendered: Any, says: str) -> None:
     with pytest.raises(VideoError, match=says):
-        plays.first_frame((rendered,), "rgb_array")
+        video.first_frame((rendered,), "rgb_array")
     for nothing in (np.zeros((0, 4, 4, 3), np.uint8), np.array(3, np.uint8), {}):
         with pytest.raises(VideoError):
-            plays.first_frame(nothing, None)
+            video.first_frame(nothing, None)
 
 
 @pytest.mark.parametrize("rendered", [None, (None,), ()])
 def test_an_environment_that_draws_nothing_is_told_how(rendered: Any) -> None:
     with pytest.raises(VideoError, match="--env-kwargs render_mode=rgb_array"):
-        plays.first_frame(rendered, None)
+        video.first_frame(rendered, None)
     with pytest.raises(VideoError, match="'human'"):
-        plays.first_frame(rendered, "human")
+        video.first_frame(rendered, "human")
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_an_environment_that_draws_nothing_is_told_how(rendered: Any) -> None:
     ids=range(13),
 )
 def test_fps_is_sensible_whatever_the_metadata_says(metadata: Any, fps: float) -> None:
-    assert plays.fps_of(metadata) == fps
+    assert video.fps_of(metadata) == fps
 
 
 @pytest.mark.parametrize("size", [(64, 48), (2, 2), (130, 6)])
@@ -86,7 +86,7 @@ def test_a_written_video_can_be_read(
     tmp_path: Path, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)  # a file that begins with a dash is a file, and no option
-    with plays.video_writer(Path("-version.mp4"), 10.0) as add:
+    with video.video_writer(Path("-version.mp4"), 10.0) as add:
         for value in range(0, 250, 10):
             add(frame(*size, value))
     path = str(tmp_path / "-version.mp4")
@@ -97,7 +97,7 @@ def test_a_written_video_can_be_read(
 
 
 def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
-    with plays.video_writer(tmp_path / "out.mp4", 10.0) as add:
+    with video.video_writer(tmp_path / "out.mp4", 10.0) as add:
         add(frame(4, 6))
         with pytest.raises(VideoError, match=r"changed from \(6, 4\) to \(4, 4\)"):
             add(frame(4, 4))
@@ -109,10 +109,10 @@ def test_targets_that_cannot_work_are_refused_early(
 ) -> None:
     (tmp_path / "folder.mp4").mkdir()
     with pytest.raises(VideoError):
-        plays.check_target(tmp_path / name)
+        video.check_target(tmp_path / name)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(VideoError, match=r"pip install 'envhub-sandbox\[video\]'"):
-        plays.check_target(tmp_path / "out.mp4")
+        video.check_target(tmp_path / "out.mp4")
 
 
 @pytest.mark.parametrize(
@@ -121,12 +121,12 @@ def test_targets_that_cannot_work_are_refused_early(
         frame(16, 16)[::-1, ::-1],
         np.broadcast_to(frame(1, 1), (16, 16, 3)),
         frame(1, 1),
-        np.lib.stride_tricks.as_strided(np.zeros(3, np.uint8), (plays.MAX_SIDE, 2, 3), (0, 0, 1)),
+        np.lib.stride_tricks.as_strided(np.zeros(3, np.uint8), (video.MAX_SIDE, 2, 3), (0, 0, 1)),
     ],
 )
 def test_views_of_every_kind_are_frames(tmp_path: Path, picture: Any) -> None:
-    with plays.video_writer(tmp_path / "x.mp4", 30.0) as add:
-        add(plays.first_frame((picture,), "rgb_array"))
+    with video.video_writer(tmp_path / "x.mp4", 30.0) as add:
+        add(video.first_frame((picture,), "rgb_array"))
     assert (tmp_path / "x.mp4").stat().st_size > 0
 
 
@@ -138,7 +138,7 @@ def test_an_environment_that_cannot_render_says_what_to_do() -> None:
             raise RemoteEnvError("NotImplementedError", "no\x1b[2J picture")
 
     with pytest.raises(VideoError, match="render_mode=rgb_array") as caught:
-        plays.frame_of(Blind())
+        video.frame_of(Blind())
     assert "NotImplementedError" in str(caught.value)
     assert "\x1b" not in str(caught.value)
 
