@@ -144,27 +144,29 @@ class SandboxVecEnv(VecEnv):
 
     def _begin_again(self, batch: Any, dones: Any, infos: list[dict[str, Any]]) -> Any:
         """Return the observations after resets of ended episodes; ``infos`` gets their last."""
-        ended = [index for index in range(self.num_envs) if dones[index]]
-        if all(has_begun_again(self._mode, infos[index]) for index in ended):
-            with UNTRUSTED:
-                self._begun(ended, infos)
+        ended = dones.copy()
+        with UNTRUSTED:
+            for index in np.flatnonzero(dones).tolist():
+                if has_begun_again(self._mode, infos[index]):
+                    self._begun(index, infos)
+                    ended[index] = False
+        if not ended.any():
             return batch
         with UNTRUSTED:
             spaces_of_both = self.observation_space, self.vector.observation_space
             lasts = list(batches.members(*spaces_of_both, batch, self.num_envs))
-            for index in ended:
+            for index in np.flatnonzero(ended).tolist():
                 last = batches.as_returned(self.observation_space, lasts[index], iter(()))
                 infos[index]["terminal_observation"] = last
-        return self._reset(None, None, dones)
+        return self._reset(None, None, ended)
 
-    def _begun(self, ended: list[int], infos: list[dict[str, Any]]) -> None:
-        """Split infos into those of an episode's end and those of the next one's beginning."""
-        for index in ended:
-            begun = infos[index]
-            last = begun.pop("final_info", {})
-            last["TimeLimit.truncated"] = begun.pop("TimeLimit.truncated")
-            last["terminal_observation"] = begun.pop("final_obs")
-            infos[index], self.reset_infos[index] = last, begun
+    def _begun(self, index: int, infos: list[dict[str, Any]]) -> None:
+        """Split an info into that of an episode's end and that of the next one's beginning."""
+        begun = infos[index]
+        last = begun.pop("final_info", {})
+        last["TimeLimit.truncated"] = begun.pop("TimeLimit.truncated")
+        last["terminal_observation"] = begun.pop("final_obs")
+        infos[index], self.reset_infos[index] = last, begun
 
     def close(self) -> None:
         """End the processes of the sub-environments. Idempotent."""

@@ -181,6 +181,22 @@ def test_results_that_are_of_nobody_break_the_rules(terminations: Any, infos: An
         env.step(np.zeros(2, int))
 
 
+def test_only_those_are_reset_that_did_not_begin_again() -> None:
+    """A class that states no mode may begin again some of the episodes that ended."""
+    final_obs = np.array([np.full(2, 7.0), None], object)
+    env = _Liar(np.ones(2, bool), {"final_obs": final_obs, "_final_obs": np.array([True, False])})
+    env.metadata, masks = {}, []
+
+    def reset(*, seed: Any, options: dict[str, Any]) -> Any:
+        masks.append(options["reset_mask"].tolist())
+        return np.ones(2), {}
+
+    env.reset = reset  # type: ignore[method-assign]
+    infos = SandboxVecEnv(env).step(np.zeros(2, int))[3]
+    assert masks == [[False, True]]
+    assert [np.max(info["terminal_observation"]) for info in infos] == [7.0, 0.0]
+
+
 def test_options_go_to_whom_they_are_for(counters: SandboxVecEnv) -> None:
     counters.set_options([{"a": 1}, {}, {"a": 2}])
     counters.reset()
