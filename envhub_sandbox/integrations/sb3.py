@@ -53,6 +53,7 @@ class SandboxVecEnv(VecEnv):
         self._apart = vector._apart() if isinstance(vector, SandboxVectorEnv) else None
         self._is_plain = hasattr(vector, "env_fns")  # a Sync- or AsyncVectorEnv, or its proxy
         self._one_for_all = True
+        self._methods: set[str] = set()  # names that are known to be those of methods
         super().__init__(
             vector.num_envs, vector.single_observation_space, vector.single_action_space
         )
@@ -209,6 +210,11 @@ class SandboxVecEnv(VecEnv):
         """Call a method of each sub-environment, or of those at ``indices``."""
         chosen = list(self._get_indices(indices))
         if chosen == list(range(self.num_envs)):
+            if self._is_plain and method_name not in self._methods:
+                method = self.envs[0].get_wrapper_attr(method_name)
+                if not callable(method):  # `call` would return it
+                    raise TypeError(f"{type(method).__name__!r} object is not callable")
+                self._methods.add(method_name)
             return list(self.vector.call(method_name, *method_args, **method_kwargs))
         return [
             self.envs[index].get_wrapper_attr(method_name)(*method_args, **method_kwargs)

@@ -216,6 +216,8 @@ def test_attributes_and_methods(counters: SandboxVecEnv) -> None:
     counters.set_attr("gain", 2.0)
     counters.set_attr("gain", 3.0, indices=1)
     assert (counters.get_attr("gain"), counters.envs[1].gain) == ([2.0, 3.0, 2.0], 3.0)
+    with pytest.raises(TypeError, match="'float' object is not callable"):
+        counters.env_method("gain")
     assert not counters.has_attr("nothing_of_the_kind")
     assert counters.has_attr("fail"), "a method is looked at, and not called"
     assert [add(1) for add in counters.get_attr("add")] == [11, 111, 211]
