@@ -186,9 +186,7 @@ class Results:
                         f"{one_line(str(self._space), _SHOWN)}"
                     )
         joined = parts[0] if len(parts) == 1 else batches.join(self._space, parts)
-        if not (self.restores and batches.conforms(self._space, joined, self.count)):
-            return joined
-        return batches.restore_batch(self._space, joined)
+        return batches.restore_batch(self._space, joined) if self.restores else joined
 
     def _per_env(self, name: str, parts: list[Any]) -> Any:
         for part, size in zip(parts, self._sizes, strict=True):

@@ -117,6 +117,34 @@ def test_what_is_none_of_it_is_named(tmp_path: Path, case: str) -> None:
         assert case in env.get_attr("case")
 
 
+_GRAPHS = """
+import gymnasium as gym
+import numpy as np
+
+class Graphs(gym.vector.VectorEnv):
+    def __init__(self, n):
+        self.num_envs = n
+        graph = gym.spaces.Graph(gym.spaces.Box(0, 1, (2,)), None, seed=1)
+        self.single_observation_space = gym.spaces.Dict(z=graph, a=gym.spaces.Discrete(2))
+        self.single_action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        graph = self.single_observation_space["z"]
+        graph.seed(seed)
+        return {"z": (graph.sample(),), "a": np.zeros(self.num_envs, np.int64)}, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return Graphs(n_envs)
+"""
+
+
+def test_graphs_keep_their_class_in_a_batch_of_any_length_and_order(tmp_path: Path) -> None:
+    names: dict[str, Any] = {}
+    exec(_GRAPHS, names)
+    with make_env(write_repository(tmp_path, _GRAPHS), n_envs=2) as suites:
+        assert_same(names["make_env"](2).reset(seed=3), suites.env.reset(seed=3))
+
+
 _WRAPPED = """
 import gymnasium as gym
 

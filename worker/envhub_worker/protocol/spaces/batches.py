@@ -464,27 +464,36 @@ def restores(space: gym.Space[Any]) -> bool:
 
 
 def restore_batch(space: gym.Space[Any], batch: Any) -> Any:
-    """Gives the members of a batch that ``conforms`` the classes that Gymnasium gives them."""
-    return _mapped(_restored, space, batch)
+    """Like ``restore``, for the members of a batch, however many."""
+    return restore(space, batch, _restored_members)
 
 
-def _restored(space: gym.Space[Any], batch: Any) -> Any:
+def _restored_members(space: Any, batch: Any) -> Any:
     return tuple(restore(space, member) for member in batch) if isinstance(batch, tuple) else batch
 
 
-def restore(space: Any, member: Any) -> Any:
-    """Gives a member the class that Gymnasium gives it. A misfit stays as it is."""
+def restore(space: Any, member: Any, leaf: Callable[[Any, Any], Any] | None = None) -> Any:
+    """Gives a member the class that Gymnasium gives it, by ``leaf`` in mappings and tuples. A
+    misfit stays as it is.
+    """
     if isinstance(space, spaces.Dict) and isinstance(member, dict):
-        subspaces = space.spaces
+        parts = space.spaces
         return {
-            k: restore(subspaces[k], item) if k in subspaces else item for k, item in member.items()
+            key: restore(parts[key], item, leaf) if key in parts else item
+            for key, item in member.items()
         }
+    if isinstance(space, spaces.Tuple) and isinstance(member, tuple):
+        if len(member) == len(space.spaces):
+            return tuple(map(partial(restore, leaf=leaf), space.spaces, member))
+        return member
+    return (leaf or _restored)(space, member)
+
+
+def _restored(space: Any, member: Any) -> Any:
     if not isinstance(member, tuple):
         return member
     if isinstance(space, spaces.Graph) and len(member) == len(GraphInstance._fields):
         return GraphInstance(*member)
-    if isinstance(space, spaces.Tuple) and len(member) == len(space.spaces):
-        return tuple(map(restore, space.spaces, member))
     if OneOf is not None and isinstance(space, OneOf):
         try:
             index, chosen = member
