@@ -29,11 +29,20 @@ def taken(info: dict[Any, Any], depth: int = _DEPTH) -> dict[Any, Any]:
     return {
         key: taken(value, depth - 1)
         if isinstance(value, dict)
-        else np.array(value)
+        else _array(value)
         if isinstance(value, np.ndarray) and key != "final_obs"
         else value
         for key, value in info.items()
     }
+
+
+def _array(value: Any) -> Any:
+    """Copies an array; a masked number is nan, as in a column."""
+    if type(value) is np.ndarray:
+        return np.array(value)
+    copy = np.zeros(value.shape, value.dtype)
+    copy[()] = value
+    return copy
 
 
 def kept(value: Any, depth: int = _DEPTH, seen: dict[int, Any] | None = None) -> Any:
