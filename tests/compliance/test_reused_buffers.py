@@ -40,9 +40,9 @@ class Reuses(gym.Env):
         self.observation["n"] = abs(value)
         for part in (self.info, self.info.get("in", {})):
             for key, old in part.items():
-                if isinstance(old, np.ndarray):
+                if isinstance(old, np.ndarray) and old.ndim:
                     old[:] = value
-                elif not isinstance(old, dict):
+                elif isinstance(old, (int, float)):
                     part[key] = type(old)(value)
         return self.observation
 

@@ -448,11 +448,14 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         """Returns the final observation and info of an episode, before a reset may overwrite them.
 
         For a single environment both are copied. For several the copies are those of the class that
-        the repository asked for: ``SyncVectorEnv`` copies ``final_info``, ``AsyncVectorEnv`` none.
+        the repository asked for: ``SyncVectorEnv`` copies ``final_info``, ``AsyncVectorEnv`` none,
+        and has it first.
         """
         if self.apart:
             return {"final_obs": kept(observation), "final_info": kept(info)}
-        return {"final_obs": observation, "final_info": taken(info) if self._sync else info}
+        if not self._sync:
+            return {"final_info": info, "final_obs": observation}
+        return {"final_obs": observation, "final_info": taken(info)}
 
     def _each(self, actions: Any) -> Iterator[Any]:
         if self._restores:
