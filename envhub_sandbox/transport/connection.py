@@ -177,7 +177,7 @@ class WorkerConnection:
         if message is not self._packed[0]:  # all steps send the same message object
             self._packed = message, m.pack(message)
         header, *buffers = self._packed[1]
-        self._send(request_id, [m.with_id(header, request_id), *buffers, *payload])
+        self._send(request_id, m.with_id(header, request_id, [*buffers, *payload]))
         return request_id
 
     def _send(self, request_id: int, frames: list[Buffer]) -> None:
@@ -186,7 +186,7 @@ class WorkerConnection:
             # noted before it is sent, so that ``receive`` can send it again over a new connection
             with self._link.lock:
                 self._sent[request_id] = self._link.next_number(), frames
-            if self._compression:
+            if self._compression and len(frames) > 1:
                 travelling = compression.pack_frames(frames, self._compression)
         size = sum(map(len, travelling))
         self._put(travelling, copy=size < LARGE_BYTES)
@@ -226,14 +226,14 @@ class WorkerConnection:
             frames = self._take()
             self._latest = frames[0]
             self.received_bytes += sum(map(len, frames))
-            if self._link is not None:
+            if self._link is not None and len(frames) > 1:
                 with UNTRUSTED:
                     frames = compression.unpack_frames(frames, self._limits)
-            reply_id, reply = m.unpack_header(frames[0], limits=self._limits)
+            reply_id, reply, payload = m.unpack_with_id(frames, limits=self._limits)
             if reply_id == request_id:
-                return reply, frames[1:]
+                return reply, payload
             if reply_id in self._kept:
-                self._arrived[reply_id] = reply, frames[1:]
+                self._arrived[reply_id] = reply, payload
             else:
                 self._sent.pop(reply_id, None)
                 self.stale_replies += 1

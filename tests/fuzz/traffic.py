@@ -24,7 +24,7 @@ _LARGEST = 1 << 16
 
 @contextmanager
 def recording(found: dict[tuple[object, ...], Frames]) -> Iterator[None]:
-    unpack, unpack_header = jail.unpacked, m.unpack_header
+    unpack, unpack_with_id = jail.unpacked, m.unpack_with_id
 
     def listen(frames: Sequence[Any], **options: Any) -> Any:
         copied = [bytes(frame) for frame in frames]
@@ -34,18 +34,18 @@ def recording(found: dict[tuple[object, ...], Frames]) -> Iterator[None]:
             found.setdefault(key, copied)
         return message
 
-    def listen_to_header(frame: Any, **options: Any) -> Any:
-        number, message = unpack_header(frame, **options)
+    def listen_to_messages(frames: Any, **options: Any) -> Any:
+        number, message, payload = unpack_with_id(frames, **options)
         listen(m.pack(message))
-        return number, message
+        return number, message, payload
 
     jail.unpacked = client_slabs.unpacked = listen
-    m.unpack_header = listen_to_header
+    m.unpack_with_id = listen_to_messages
     try:
         yield
     finally:
         jail.unpacked = client_slabs.unpacked = unpack
-        m.unpack_header = unpack_header
+        m.unpack_with_id = unpack_with_id
 
 
 def record() -> list[Frames]:

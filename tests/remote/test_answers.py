@@ -85,7 +85,7 @@ def test_many_in_a_row_do_not_end_the_server(client: Peer, good: Any, server: Li
         # a few large ones: a server that only decrypts hears of nobody's life
         client.tell(m.PutBlob(b"h" * (2 * MIB + 1 if number < 8 else 3), 0), b"data")
         client.socket.send_multipart([b"\0\0\0\0"])
-        client.socket.send_multipart([b"\xff" * 100])
+        client.socket.send_multipart([b"\x80" + bytes(99)])
         client.socket.send_multipart([b""])
     assert isinstance(client.ask(m.GetStatus()), (m.Status, m.Refusal))
     assert server.process.poll() is None

@@ -55,8 +55,8 @@ class Asked:
             assert isinstance(message, m.Message)
             return m.pack_header(message, number)
         frames = m.pack(message) if isinstance(message, m.Message) else message
-        relayed = m.RelayDone((len(frames),))
-        return [*m.pack_header(relayed, number), *frames]
+        [header] = m.pack(m.RelayDone((len(frames),)))
+        return m.with_id(header, number, frames)
 
 
 @dataclass(eq=False)
@@ -91,10 +91,10 @@ class LyingServer(WorkerServer):
 
     def _answers(self, frames: list[bytes]) -> list[Frames]:
         self.heard += b"".join(frames)
-        request_id, request = m.unpack_header(frames[0])
+        request_id, request, payload = m.unpack_with_id(frames)
         relayed = isinstance(request, m.Relay)
         if relayed and not request.stepped:
-            request = m.unpack(frames[1:], unpickler=lambda data: data)
+            request = m.unpack(payload, unpickler=lambda data: data)
         self.asked.append(request)
         asked = Asked(request_id, request, relayed, honest(request))
         lie = self.lies.get(type(request))

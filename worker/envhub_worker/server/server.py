@@ -154,15 +154,15 @@ class Server:
             return
         session = self._sessions.find(identity, key)
         try:
-            if self._compression(identity, key):
+            if len(frames) > 1 and self._compression(identity, key):
                 frames[:] = compression.unpack_frames(frames, DEFAULT_LIMITS)
-            number, request = m.unpack_header(frames[0])
+            number, request, payload = m.unpack_with_id(frames)
         except Exception as error:
             self._refuse_unread(identity, key, frames[0], error)
             return
         asker = Asker(identity, number, b"" if session is None else session.owner, key)
         try:
-            reply = self._dispatch(asker, request, arrived)
+            reply = self._dispatch(asker, request, payload, arrived)
             if reply is not None:
                 self.reply(asker, reply)
         except AnsweredError as early:
@@ -183,11 +183,12 @@ class Server:
         refused = RefusedError("LocalProtocolError", f"the request cannot be read: {text}")
         self.reply(Asker(identity, number, b"", key), refused.reply)
 
-    def _dispatch(self, asker: Asker, request: m.Message, arrived: Incoming) -> m.Message | None:
+    def _dispatch(
+        self, asker: Asker, request: m.Message, payload: list[Any], arrived: Incoming
+    ) -> m.Message | None:
         """Returns the reply; None if it was sent or comes later. Raises ``AnsweredError``."""
         if isinstance(request, m.Hello):
             return self._hello(request, arrived)
-        payload = arrived.frames[1:]
         if not asker.session:
             raise RefusedError("HelloError", _NO_HELLO)
         request = self._gate.authorize(asker, request, payload)
@@ -208,8 +209,8 @@ class Server:
             if type(message) is m.RelayDone
             else m.pack(message)
         )
-        frames = [m.with_id(header, asker.request_id), *buffers, *payload]
-        if agreed := self._compression(asker.identity, asker.key):
+        frames = m.with_id(header, asker.request_id, [*buffers, *payload])
+        if len(frames) > 1 and (agreed := self._compression(asker.identity, asker.key)):
             frames = compression.pack_frames(frames, agreed)
         copy = sum(map(len, payload)) < LARGE_BYTES
         send(self._router, [asker.identity, *frames], copy=copy)

@@ -128,13 +128,37 @@ def test_the_id_of_a_header_that_cannot_be_read_is_known() -> None:
 
 
 @pytest.mark.parametrize(
-    "start", [b"", b"\0\0\0", *(number.to_bytes(8, "big") for number in (0, 2**63, 2**64 - 1))]
+    "start", [b"", b"\0\0\0", *(number.to_bytes(8, "big") for number in (0, 2**63))]
 )
 def test_an_impossible_id_is_refused(start: bytes) -> None:
     frame = start + bytes(m.pack(m.Done())[0]) if len(start) == 8 else start
     assert m.id_of(frame) is None
     with pytest.raises(RemoteProtocolError, match="not start with the id"):
         m.unpack_header(frame)
+
+
+def test_a_small_payload_travels_in_the_frame_of_the_header() -> None:
+    relayed, message = m.pack(m.RelayDone((1,)))[0], m.RelayDone((1,))
+    [frame] = m.with_id(relayed, REQUEST_ID, [b"payload"])
+    for read in (bytes(frame), memoryview(frame)):
+        assert m.unpack_with_id([read]) == (REQUEST_ID, message, [b"payload"])
+    [empty] = m.with_id(relayed, REQUEST_ID, [b""])
+    assert m.unpack_with_id([empty]) == (REQUEST_ID, message, [b""])
+    for apart in ([b"a", b"b"], [bytes(1 << 20)], []):
+        assert len(frames := m.with_id(relayed, REQUEST_ID, apart)) == 1 + len(apart)
+        assert m.unpack_with_id(frames) == (REQUEST_ID, message, apart)
+
+
+@pytest.mark.parametrize(("start", "more"), [(8, []), (11, []), (12, []), (20, []), (None, [b"x"])])
+def test_a_joined_frame_that_is_cut_off_or_not_alone_is_refused(
+    start: int | None, more: list[bytes]
+) -> None:
+    [frame] = m.with_id(m.pack(m.RelayDone((1,)))[0], REQUEST_ID, [bytes(2)])
+    assert len(frame) > 20
+    cut = bytes(frame)[:start]
+    assert m.id_of(cut) == REQUEST_ID, "its sender gets the refusal"
+    with pytest.raises(RemoteProtocolError):
+        m.unpack_with_id([cut, *more])
 
 
 @pytest.mark.parametrize("number", [1, 148 + 25 * 256, 2**63 - 1])

@@ -119,6 +119,10 @@ def check_fields(cls: type[Message], values: list[object]) -> None:
 _NUMBER = struct.Struct(">Q")
 """The id in front of a header between client and server; 0 for ``CompressionHeader`` alone."""
 _MOST = (1 << 63) - 1
+_JOINED = 1 << 63
+"""Marks an id whose message has one further frame, which follows the header in the same frame."""
+_JOINED_BYTES = 8 * 1024
+"""A frame below this joins the header: each frame is encrypted, sent and received for itself."""
 _INCOMING = Forms()
 """By the document, with its length in front: the whole header, where there are no arrays."""
 
@@ -195,26 +199,41 @@ def _alone(frames: Sequence[Buffer]) -> bytes:
 def pack_header(message: Message, number: int) -> list[Buffer]:
     """Encodes a message between client and server, with its id in front of the header."""
     header, *buffers = pack(message)
-    return [with_id(header, number), *buffers]
+    return [_NUMBER.pack(number) + header, *buffers]
 
 
-def with_id(header: Buffer, number: int) -> Buffer:
-    """Puts the id of a request in front of a header."""
-    return _NUMBER.pack(number) + header
+def with_id(header: Buffer, number: int, payload: Sequence[Buffer]) -> list[Buffer]:
+    """Puts the id of a request in front of a header without arrays; joins a small payload to it."""
+    if len(payload) == 1 and len(payload[0]) < _JOINED_BYTES:
+        return [b"".join((_NUMBER.pack(number | _JOINED), header, payload[0]))]
+    return [_NUMBER.pack(number) + header, *payload]
 
 
 def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> tuple[int, Message]:
-    """Decodes a header as its id and its message. Trust: input from the other side.
+    """``unpack_with_id`` without the payload."""
+    return unpack_with_id([frame], limits=limits)[:2]
+
+
+def unpack_with_id(
+    frames: Sequence[Buffer], *, limits: WireLimits = DEFAULT_LIMITS
+) -> tuple[int, Message, list[Buffer]]:
+    """Decodes an id, its message, and the payload. Trust: input from the other side.
     Raises ``RemoteProtocolError``: the peer broke the rules.
     """
-    number = id_of(frame)
+    first, *payload = frames
+    number = id_of(first)
     if number is None:
         raise RemoteProtocolError("the header does not start with the id of a request")
-    header = without_id(frame)
+    header = without_id(first)
+    if first[0] & 0x80:  # ``_JOINED``
+        if payload or len(header) < DOCUMENT_BYTES.size:
+            raise RemoteProtocolError("a frame is not the only one of its message, or too short")
+        end = DOCUMENT_BYTES.size + DOCUMENT_BYTES.unpack_from(header)[0]
+        header, payload = header[:end], [header[end:]]
     form = _INCOMING.get(header) if type(header) is bytes else None
     if form is not None and form.limits is limits:  # as unpack, which a step need not call
-        return number, form.message()
-    return number, unpack([header], limits=limits)
+        return number, form.message(), payload
+    return number, unpack([header], limits=limits), payload
 
 
 def without_id(frame: Buffer) -> Buffer:
@@ -225,7 +244,7 @@ def without_id(frame: Buffer) -> Buffer:
 def id_of(frame: Buffer) -> int | None:
     """The id in front of a header; None if there is none. Trust: input from the other side."""
     number = number_of(frame)
-    return number if number is not None and 0 < number <= _MOST else None
+    return number & _MOST or None if number is not None else None
 
 
 def number_of(frame: Buffer) -> int | None:
