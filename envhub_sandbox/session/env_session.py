@@ -9,14 +9,11 @@ and refuses all use in a fork, by the rules of docs/internals/interruption.md.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any, cast
 
 from envhub_sandbox.errors import (
     EnvHubError,
-    LocalProtocolError,
-    RemoteEnvError,
     WorkerDiedError,
     WorkerError,
     WorkerTimeoutError,
@@ -104,27 +101,6 @@ class EnvSession:
     def rows(self) -> tuple[int, int]:
         """The first of its sub-environments, and the one after the last."""
         return self.bounds[0][0], self.bounds[-1][1]
-
-    @contextmanager
-    def naming(self) -> Iterator[None]:
-        """Add to errors which sub-environments they concern, and where these run."""
-        try:
-            yield
-        except EnvHubError as error:
-            self.name_in(error)
-            raise
-
-    def name_in(self, error: EnvHubError) -> None:
-        """Add this worker's rows and place to an error, unless repository or caller caused it."""
-        if isinstance(error, (RemoteEnvError, LocalProtocolError)) or not error.args:
-            return
-        start, stop = self.rows
-        alone = stop == start + 1
-        rows = f"sub-environment {start}" if alone else f"sub-environments {start} to {stop - 1}"
-        position = f"({rows} of {self.manifest.num_envs}, on {self.lease.place})"
-        if position not in str(error.args[0]):
-            first, *rest = str(error.args[0]).split("\n")
-            error.args = ("\n".join([f"{first} {position}", *rest]), *error.args[1:])
 
     def usage(self) -> dict[str, int]:
         """What its jail uses, as counted by the server; empty if the server does not say."""

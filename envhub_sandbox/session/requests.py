@@ -31,7 +31,7 @@ from envhub_sandbox.session.lease import AttributeCache, Lease
 from envhub_sandbox.session.prewarm import Prewarm
 from envhub_sandbox.session.recorder import Recorder
 from envhub_sandbox.session.repository import Repository
-from envhub_sandbox.session.use_lock import FleetUse, UseLock
+from envhub_sandbox.session.use_lock import Use, UseLock
 from envhub_sandbox.system.log import warn_caller
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline, deadline_of
 from envhub_sandbox.transport.replies import RunnersDiedError
@@ -85,7 +85,7 @@ class RequestOrder(ABC):
         self,
         repository: Repository,
         results: Results,
-        use: UseLock | FleetUse,
+        use: Use,
         attributes: AttributeCache,
     ) -> None:
         self.results = results

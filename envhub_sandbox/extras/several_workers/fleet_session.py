@@ -25,7 +25,10 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.session.counters import LEDGER, FleetCounters, Labels
+from envhub_sandbox.extras.several_workers.fleet_counters import FleetCounters
+from envhub_sandbox.extras.several_workers.part_errors import naming
+from envhub_sandbox.extras.several_workers.part_locks import FleetUse
+from envhub_sandbox.session.counters import LEDGER, Labels
 from envhub_sandbox.session.env_session import GRACE_S, EnvSession
 from envhub_sandbox.session.lease import AttributeCache
 from envhub_sandbox.session.recorder import Recorder
@@ -35,7 +38,6 @@ from envhub_sandbox.session.requests import (
     RequestOrder,
     Requests,
 )
-from envhub_sandbox.session.use_lock import FleetUse
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.threads import Calls
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline, deadline_of
@@ -130,7 +132,7 @@ class FleetSession:
             for part in self.parts:
                 part.notice_death()
         for part in self.parts:
-            with part.naming():
+            with naming(part):
                 part.recover(grace)
 
     def close(self) -> None:
@@ -225,7 +227,7 @@ class FleetRequests(RequestOrder):
                 self.before_request()
             at = next(i for i, (start, stop) in enumerate(self.results.bounds) if index < stop)
             try:
-                with self._parts[at].naming():
+                with naming(self._parts[at]):
                     return self._each[at].ask_one(name, index, message)
             finally:
                 self.note_answered()
@@ -361,12 +363,12 @@ class FleetRequests(RequestOrder):
         idle = [at for at, state in enumerate(states) if state is State.IDLE]
         for at, requests in enumerate(self._each):
             if at not in idle:
-                with self._parts[at].naming():
+                with naming(self._parts[at]):
                     requests.make_ready(operation)
         if idle:
             started = self._start([self._parts[at] for at in idle])
             for at, start in zip(idle, started, strict=True):
-                with self._parts[at].naming():
+                with naming(self._parts[at]):
                     self._each[at].make_ready(operation, start)
 
     def _start(self, parts: Sequence[EnvSession]) -> list[Callable[[], None]]:
@@ -404,7 +406,7 @@ class FleetRequests(RequestOrder):
                 send(at)
             except Exception as error:
                 if at == 0:
-                    with self._parts[at].naming():
+                    with naming(self._parts[at]):
                         raise
                 self._unsent[at] = error
                 self._each[at].fall_behind()
@@ -432,7 +434,7 @@ class FleetRequests(RequestOrder):
         for other in failures.values():
             WORKER.info("%s: also: %s", self._repository.label, other)
         try:
-            with self._parts[first].naming():
+            with naming(self._parts[first]):
                 raise error
         finally:
             self.explain(error)

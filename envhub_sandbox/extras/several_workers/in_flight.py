@@ -22,13 +22,13 @@ import numpy as np
 from gymnasium.error import NoAsyncCallError
 
 from envhub_sandbox.errors import ActionError, EnvHubError, RemoteEnvWarning, WorkerTimeoutError
+from envhub_sandbox.extras.several_workers.part_locks import FleetUse, all_held
 from envhub_sandbox.extras.several_workers.received_infos import gather_infos
 from envhub_sandbox.extras.several_workers.shard_queue import ShardQueue
 from envhub_sandbox.extras.several_workers.worker_queue import WorkerQueue
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.failures import refusal
 from envhub_sandbox.session.requests import SENT, MessageFor, RequestOrder
-from envhub_sandbox.session.use_lock import FleetUse, all_held
 from envhub_sandbox.transport.deadline import Deadline, deadline_of
 from envhub_sandbox.transport.lane import answered_first
 from envhub_sandbox.transport.results import StepResult

@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium.error import AlreadyPendingCallError
 
 from envhub_sandbox.errors import EnvHubError, RemoteEnvWarning, RemoteProtocolError
+from envhub_sandbox.extras.several_workers.part_errors import name_in
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.requests import MessageFor
 from envhub_sandbox.transport.deadline import Deadline
@@ -181,7 +182,7 @@ class WorkerQueue:
         try:
             yield
         except EnvHubError as error:
-            self.part.name_in(error)
+            name_in(self.part, error)
             error.env_ids = self._lost
             raise
 

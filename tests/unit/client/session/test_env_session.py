@@ -7,6 +7,7 @@ from unittest.mock import MagicMock, Mock
 import pytest
 
 from envhub_sandbox import errors
+from envhub_sandbox.extras.several_workers.part_errors import name_in
 from envhub_sandbox.session.lease import AttributeCache
 from envhub_sandbox.session.use_lock import UseLock
 from envhub_worker.protocol.lifecycle import State
@@ -24,10 +25,10 @@ def test_the_first_line_names_the_rows_and_the_place(rows: tuple[int, int], name
     error = errors.WorkerDiedError("it has ended\nits last words")
     error.args = (*error.args, "more")
     for _ in range(2):
-        part.name_in(error)
+        name_in(part, error)
         assert error.args == (f"it has ended ({named}, on here)\nits last words", "more")
     assert part.rows == rows
-    session_over(FakeLane(1), (0, 1)).name_in(error)
+    name_in(session_over(FakeLane(1), (0, 1)), error)
     assert error.args[0].splitlines()[0].endswith("on here) (sub-environment 0 of 2, on here)")
 
 
@@ -39,7 +40,7 @@ def test_errors_of_others_keep_their_text() -> None:
     bare.args = ()
     for error in (theirs, errors.LocalProtocolError("a lambda cannot be sent"), bare):
         before = error.args
-        part.name_in(error)
+        name_in(part, error)
         assert error.args == before
 
 

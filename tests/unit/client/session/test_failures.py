@@ -8,7 +8,8 @@ from unittest.mock import MagicMock
 import pytest
 
 from envhub_sandbox.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.session.counters import Counters, FleetCounters
+from envhub_sandbox.extras.several_workers.fleet_counters import FleetCounters
+from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.failures import Failures, backoff_s, refusal
 from envhub_sandbox.session.recorder import Recorder, recorder_for
 from envhub_worker.protocol import messages as m
