@@ -2,10 +2,8 @@
 
 import copy
 import pickle
-import sys
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,8 +12,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from envhub_sandbox.errors import DependencyError, RemoteEnvWarning, RemoteProtocolError
-from envhub_sandbox.transport import values
+from envhub_sandbox.errors import RemoteEnvWarning, RemoteProtocolError
 from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
 from envhub_sandbox.transport.values import DescriptionReader
 from envhub_worker.protocol import messages as m
@@ -168,16 +165,3 @@ def test_what_the_filters_raise_leaves_the_rest() -> None:
             heard.show("a/b@c")
     [two] = told(heard)
     assert two.message.text == "two"
-
-
-def test_broken_torch_is_no_workers_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    torch = pytest.importorskip("torch")
-    frames = m.pack(m.Value(torch.zeros(2)))
-    (tmp_path / "torch.py").write_text("raise RuntimeError('another numpy')")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delitem(sys.modules, "torch")
-    values.installed_torch.cache_clear()
-    with pytest.raises(DependencyError, match=r"torch is installed here.*another numpy"):
-        values.unpacked(frames)
-    monkeypatch.undo()
-    assert values.unpacked(frames).value.tolist() == [0, 0]

@@ -79,13 +79,6 @@ def test_without_a_count_the_space_is_that_of_the_whole_batch(name: str) -> None
     assert_same(sample, batch_of(space, sample, None))
 
 
-def test_tensors_are_taken() -> None:
-    torch = pytest.importorskip("torch")
-    for dtype in (torch.float32, torch.bfloat16):
-        value = torch.ones((2, 2), requires_grad=True, dtype=dtype)
-        assert_same(np.ones((2, 2), np.float32), batch_of(BOX, value, 2))
-
-
 @pytest.mark.parametrize(
     ("space", "value", "complaint"),
     [

@@ -163,13 +163,6 @@ def test_keys_that_look_alike_are_numbered() -> None:
     assert list(through({(objects[0], 1): "a", (objects[1], 1): "b"}).values()) == ["a", "b"]
 
 
-def test_keys_that_cannot_be_hashed_here_are_described() -> None:
-    torch = pytest.importorskip("torch")
-    for key in (torch.zeros(2), (1, torch.zeros(2))):
-        assert [type(one) for one in through({key: 1})] == [RemoteObject]
-    assert [type(one) for one in through({torch.zeros(2)})] == [RemoteObject]
-
-
 def test_description_is_bounded_printable_and_without_addresses() -> None:
     """A description never drives a terminal, never floods a log, and is the same every time."""
     loud = type("Loud", (), {"__repr__": lambda self: "\x1b[2J\n\u202e" + "x" * 10_000})()
@@ -212,25 +205,6 @@ def test_arrays_of_other_libraries_arrive_as_numpy_arrays() -> None:
     assert_same({"x": np.arange(3.0)}, through({"x": Foreign()}))
     with pytest.raises(LocalProtocolError, match=r"obs\[.x.\] cannot be sent: Array has been"):
         encode({"obs": {"x": Broken()}})
-
-
-def test_torch_tensors_arrive_as_tensors_or_arrays() -> None:
-    torch = pytest.importorskip("torch")
-    source = [
-        torch.arange(6.0, requires_grad=True).reshape(2, 3),
-        torch.tensor([1 + 2j]).conj(),
-        torch.tensor(True),
-        torch.tensor([1.5, -2.0], dtype=torch.bfloat16),
-        torch.nn.Parameter(torch.ones(2)),
-    ]
-    made = through(source, tensors=lambda array, name: (name, array))
-    assert [name for name, _ in made] == ["float32", "complex64", "bool", "bfloat16", "float32"]
-    arrays: Any = through(source)
-    for tensor, array in zip(source, arrays, strict=True):
-        wide = tensor.detach().resolve_conj()
-        expected = wide.float() if wide.dtype == torch.bfloat16 else wide
-        assert_same(expected.numpy(), array)
-    assert isinstance(through(torch.eye(2).to_sparse()), RemoteObject)
 
 
 # --- what cannot be sent ------------------------------------------------------------------------

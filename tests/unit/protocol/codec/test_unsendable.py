@@ -46,14 +46,6 @@ def test_what_is_called_arrives_as_it_is() -> None:
         assert type(arrived(3)).__name__ == type(function(3)).__name__
 
 
-def test_a_tensor_arrives_as_it_is() -> None:
-    torch = pytest.importorskip("torch")
-    tensor = torch.arange(6, dtype=torch.bfloat16).reshape(2, 3)
-    arrived = through(tensor)
-    assert arrived.dtype is torch.bfloat16
-    assert torch.equal(arrived, tensor)
-
-
 def test_what_holds_itself_arrives_so() -> None:
     """One piece is pickled, not each leaf: what is the same object stays the same."""
     arrived = through(handed.CYCLIC)

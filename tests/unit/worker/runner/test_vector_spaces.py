@@ -92,14 +92,6 @@ def test_the_first_observation_tells_one_from_the_batch(count: int, space: Space
     assert known == VectorSpaces(batch, batch, batch, batch)
 
 
-def test_a_tensor_tells_as_an_array_does() -> None:
-    torch = pytest.importorskip("torch")
-    known = spaces_of(vector(torch.zeros(3, 2, requires_grad=True), **one_space(ROW, ROW)), {})
-    assert known.action_space == ROWS
-    known = spaces_of(vector(torch.zeros(3, 2, requires_grad=True), action_space=ROW), {})
-    assert known.single_observation_space.shape == (2,)
-
-
 def test_a_shape_that_is_not_the_spaces_tells_by_its_dimensions() -> None:
     known = spaces_of(vector(np.zeros((3, 5)), **one_space(ROW, ROW)), {})
     assert (known.single_action_space, known.action_space) == (ROW, ROWS)
