@@ -252,6 +252,8 @@ HARMLESS_DENIALS = denials._HARMLESS
 """What a recorded jail is denied that is no attempt of the repository's."""
 PATIENCE_FOR_AN_END: Spot = (task, "_EPISODE_S")
 """Seconds in which the judge looks for the end of an episode."""
+FETCHING_THE_REST_S: Spot = (output, "_ASK_S")
+"""How long a server may go on answering who wants a jail's last output."""
 wrong_types = task._untyped
 wrong_masks = traces._masks
 info_bytes = traces._bytes_of

@@ -145,8 +145,11 @@ def test_an_answer_that_crosses_with_the_listening_is_found(lanes: list[FakeLane
     assert found(lanes, None) == [2]
 
 
-def test_endless_rings_hide_no_other(lanes: list[FakeLane]) -> None:
+def test_endless_rings_hide_no_other(
+    lanes: list[FakeLane], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A hostile runner rings and never answers: another's answer is found, and the deadline is."""
+    monkeypatch.setattr("envhub_sandbox.transport.lane.LOOK_MS", 5)
     lanes[0].ring()  # and it stays readable
     assert found(lanes, 0.05) == []
     looks = iter(range(20))

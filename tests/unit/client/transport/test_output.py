@@ -13,6 +13,7 @@ from envhub_sandbox.transport import output
 from envhub_sandbox.transport.output import Lines, OutputFollower, OutputSinks
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import OutputTail
+from tests.support import inside
 
 
 def lines_of(*chunks: bytes) -> list[str]:
@@ -105,8 +106,9 @@ def test_what_is_told_does_not_begin_amid_a_line(end: str) -> None:
     tail.close()
 
 
-def test_a_follower_ends_though_a_server_does_not() -> None:
+def test_a_follower_ends_though_a_server_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     """It has more at each request, for ever; who stops following is not kept busy."""
+    monkeypatch.setattr(*inside.FETCHING_THE_REST_S, 0.1)
     ended = threading.Event()
 
     def more(request: m.FollowOutput, **_: object) -> tuple[m.Message, list[object]]:
