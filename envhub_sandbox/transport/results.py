@@ -33,6 +33,7 @@ class Results:
         slices: The same as ``bounds``, counted from the first of these sub-environments.
         apart: Whether infos are returned as each sub-environment returned them: ``own`` and
             ``joined`` read these.
+        is_sliced: Whether infos come as those of slices, which are to be joined.
         single: Whether a single environment is shown, which the runner never resets by itself.
         restores: Whether members of the space lose their class on the wire, and get it back here.
         max_bytes: How much larger than their own the workers' infos may be when joined.
@@ -51,7 +52,7 @@ class Results:
         self.slices = [(start - first, stop - first) for start, stop in bounds]
         self.count = sum(self._sizes)
         self._is_part = self._declared and self.count < manifest.num_envs
-        self._is_sliced = self._declared and self._sizes != [manifest.num_envs]
+        self.is_sliced = self._declared and self._sizes != [manifest.num_envs]
         self.restores = batches.restores(self._space)
 
     def step(self, replies: list[m.StepDone]) -> StepResult:
@@ -94,7 +95,7 @@ class Results:
         with it. Trust: input from the worker.
         Raises ``RemoteEnvError``: Gymnasium would raise, too.
         """
-        if not self._is_sliced:
+        if not self.is_sliced:
             return parts[0] if self.apart else self._restored(parts[0])
         if not any(parts):
             return {}

@@ -259,11 +259,12 @@ class ShardSlabs:
                 infos, columns = message.value, columns_of(message.value) or ()
                 beside = {key: value for key, value in infos.items() if type(key) is int}
                 self.schema = [(column, column.view(self._reply, start)) for column in columns]
-                keys = [column.key for column in columns]
+                masks = masks_of(columns)
+                forms = {column.key: masks.get(column.key) for column in columns}
                 self._columns = Copies(
-                    [view for _, view in self.schema],
-                    [column.dtype for column in columns],
-                    partial(_infos_of_copies, keys, beside),
+                    [view for column, view in self.schema if column.key not in masks],
+                    [column.dtype for column in columns if column.key not in masks],
+                    partial(_infos_of_copies, forms, beside),
                 )
                 known = (column.offset + view.nbytes for column, view in self.schema)
                 self._asks[slabs.KNOWN] = max(known, default=0)
@@ -444,10 +445,24 @@ class LaneShard(ShardSlabs):
         super().close()
 
 
+def masks_of(columns: Sequence[slabs.Column]) -> dict[str, Any]:
+    """The masks among columns. Infos come as columns only if every sub-environment has each value,
+    so the masks are all true, and nobody reads what the worker writes there.
+    """
+    keys = {f"_{column.key}" for column in columns}
+    return {
+        column.key: np.ones(column.shape, np.bool_)
+        for column in columns
+        if column.key in keys and column.dtype == _BOOL
+    }
+
+
 def _infos_of_copies(
-    keys: Sequence[str], beside: dict[Any, Any], copies: Sequence[Any]
+    forms: dict[str, Any], beside: dict[Any, Any], copies: Sequence[Any]
 ) -> dict[Any, Any]:
-    return {**dict(zip(keys, copies, strict=True)), **beside}
+    values = iter(copies)
+    infos = {key: next(values) if mask is None else mask.copy() for key, mask in forms.items()}
+    return {**infos, **beside}
 
 
 class Copies:
@@ -492,8 +507,8 @@ class JoinedColumns:
         bounds: The slice of sub-environments of each shard.
 
     Attributes:
-        columns: Name, shape, dtype and the shards' parts of each column; empty if the schemas
-            differ, or if a column lacks a value for some sub-environment.
+        columns: Name, shape, dtype and the shards' parts of each column, no parts of a mask; empty
+            if the schemas differ, or if a column lacks a value for some sub-environment.
     """
 
     def __init__(self, schemas: Sequence[Schema], bounds: Sequence[tuple[int, int]]) -> None:
@@ -502,8 +517,9 @@ class JoinedColumns:
         forms = [[(one.key, one.dtype, one.shape[1:]) for one, _ in schema] for schema in schemas]
         rows = [{one.shape[0] if one.shape else 0 for one, _ in schema} for schema in schemas]
         if forms and forms == [forms[0]] * len(forms) and rows == [{b - a} for a, b in bounds]:
+            masks = masks_of([column for column, _ in schemas[0]])
             for index, (key, dtype, tail) in enumerate(forms[0]):
-                parts = [schema[index][1] for schema in schemas]
+                parts = [] if key in masks else [schema[index][1] for schema in schemas]
                 self.columns.append((key, (bounds[-1][1], *tail), dtype, parts))
 
     def is_of(self, schemas: Sequence[Schema]) -> bool:
@@ -512,9 +528,11 @@ class JoinedColumns:
         return len(known) == len(schemas) and all(map(operator.is_, known, schemas))
 
     def infos(self) -> dict[Any, Any]:
-        """The joined infos, in new arrays. Trust: reads each byte once; a nonzero mask is true."""
+        """The joined infos, in new arrays. Trust: reads each byte once; a nonzero byte is true."""
         return {
             key: np.concatenate(parts, out=np.empty(shape, dtype), casting="unsafe")
+            if parts
+            else np.ones(shape, dtype)
             for key, shape, dtype, parts in self.columns
         }
 

@@ -27,6 +27,7 @@ from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 
 STEP = "step"
+_COLUMNS: list[Outcome] = [(slabs.COLUMNS, None)]
 
 
 class StepBatch(Protocol):
@@ -176,6 +177,8 @@ class ColumnSteps(SlabLane):
         return observation, rewards, over, cut, self._infos() if self._said else {}
 
     def _infos(self) -> dict[Any, Any]:
+        if self._said == _COLUMNS and not self.declared.is_sliced:
+            return self.shards[0].columns()
         joins = len(self.shards) > 1 and not self.declared.unjoined
         if joins and all(kind == slabs.COLUMNS for kind, _ in self._said):
             schemas = [shard.schema for shard in self.shards]

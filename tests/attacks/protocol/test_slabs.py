@@ -234,6 +234,22 @@ def test_columns_without_a_schema_are_refused(shard: LaneShard) -> None:
         shard.columns()
 
 
+def test_values_of_columns_are_the_workers_and_masks_are_ours(shard: LaneShard) -> None:
+    """The values are the control: they lie before the mask in the same bytes."""
+    shard.write([np.zeros((2, 2), np.float32)], (0, 0, 0))
+    infos = bytes(m.pack(m.Value({"a": np.zeros(2), "_a": np.ones(2, bool)}))[0])
+    attack(
+        shard,
+        f"os.pwrite(reply, {infos!r}, {slabs.INFOS})\n"
+        f"os.pwrite(reply, struct.pack('QQ', {slabs.DONE}, {len(infos)}), {slabs.OUTCOME * 8})",
+    )
+    shard.outcome()
+    attack(shard, f"os.pwrite(reply, struct.pack('dd48xBB', 7, 8, 2, 0), {slabs.INFOS})")
+    columns = shard.columns()
+    assert columns["a"].tolist() == [7, 8]
+    assert columns["_a"].tobytes() == b"\1\1"
+
+
 def test_other_bytes_become_booleans(shard: LaneShard, observations: ObservationSlab) -> None:
     os.pwrite(observations.fd, b"\x02" * 4, observations.layout.results + 16)
     os.pwrite(observations.fd, b"\x02" * 16, 0)

@@ -10,8 +10,10 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
+import struct
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
+from itertools import chain
 from time import perf_counter_ns
 from typing import Any
 
@@ -392,13 +394,11 @@ class InfoWriter:
         self._pack = pack
         self._joined = joined
         self._integers: Sequence[bool] = ()
-        # The schema that the client knows too: keys and classes of each info, and views of the slab
-        # for the values and for the masks. None: the next infos go encoded.
+        # The schema that the client knows too: keys and classes of each info, and what writes the
+        # values of all, key by key. None: the next infos go encoded.
         self._keys: list[Any] | None = None
         self._types: list[type] = []
-        self._rows: list[Any] = []
-        self._masks: list[Any] = []
-        self._fresh = False  # whether encoded infos lie where the columns do
+        self._write_values: Callable[..., None] = struct.pack_into
 
     def write(
         self, pairs: Pairs, integers: Sequence[bool] = (), *, encoded: bool = False
@@ -422,30 +422,28 @@ class InfoWriter:
     def put(self, frame: Any) -> int:
         """Write encoded bytes; returns their number."""
         size = memoryview(frame).nbytes
-        self._fresh = True
         self._reply[self._start : self._start + size] = frame
         return size
 
     def _write_columns(self, pairs: Pairs) -> bool:
         if len(pairs) != self._count:
             return False
-        keys, types = self._keys, self._types
+        keys, types, rows = self._keys, self._types, []
         for expected, (index, info) in enumerate(pairs):
-            if index != expected or [*info] != keys or [*map(type, info.values())] != types:
+            values = info.values()
+            if index != expected or [*info] != keys or [*map(type, values)] != types:
                 return False
+            rows.append(values)
         try:
-            for row, *column in zip(self._rows, *[info.values() for _, info in pairs], strict=True):
-                row[...] = column
-        except OverflowError:  # an integer beyond 64 bit: joining fails of it, or it goes encoded
-            return False
-        if self._fresh:  # the encoded infos lay here
-            for mask in self._masks:
-                mask[...] = 1
-            self._fresh = False
+            self._write_values(self._reply, self._start, *chain(*zip(*rows, strict=True)))
+        except (OverflowError, struct.error):  # an integer beyond 64 bit: joining fails of it, or
+            return False  # it goes encoded
         return True
 
     def _learn(self, pairs: Pairs, infos: dict[Any, Any]) -> None:
-        """Learn columns for scalars that every sub-environment has: their masks are all true."""
+        """Learn columns for scalars that every sub-environment has. The client does not read their
+        masks, which are all true.
+        """
         self._keys = None
         columns = slabs.columns_of(infos)
         first = pairs[0][1] if pairs else {}
@@ -453,11 +451,23 @@ class InfoWriter:
         if (
             columns is None
             or len(pairs) != self._count
-            or len(columns) != 2 * len(first)
+            or [column.key for column in columns] != [*chain(*((key, f"_{key}") for key in first))]
             or not all(map(batches.is_scalar, types))
         ):
             return
-        views = {column.key: column.view(self._reply, self._start) for column in columns}
-        self._rows = [views[key] for key in first]
-        self._masks = [views[f"_{key}"] for key in first]
-        self._keys, self._types, self._fresh = list(first), types, True
+        form, end = "", 0
+        for column in columns[::2]:
+            form += f"{column.offset - end}x{self._count}{column.dtype.char}"
+            end = column.offset + self._count * column.dtype.itemsize
+        rows = [column.view(self._reply, self._start) for column in columns[::2]]
+        # ``struct`` has numpy's codes, but changes the bits of a NaN in fewer than 64
+        exact = {"e", "f"}.isdisjoint(form)
+        self._write_values = struct.Struct(form).pack_into if exact else partial(_write_rows, rows)
+        self._keys, self._types = list(first), types
+
+
+def _write_rows(rows: Sequence[Any], _: Any, start: int, *values: Any) -> None:
+    """Like ``struct.pack_into``, into these rows of equal length."""
+    count = len(values) // len(rows)
+    for index, row in enumerate(rows):
+        row[...] = values[index * count : (index + 1) * count]

@@ -76,7 +76,9 @@ class Slab:
         outcome, length = self.writer.write(pairs)
         self.outcomes.append(outcome)
         if outcome == slabs.COLUMNS:
-            return {c.key: c.view(self.memory, 0).astype(c.dtype) for c in self.columns}
+            masks = {f"_{key}": np.ones(self.count, bool) for key in infos[0]}  # the client's own
+            columns = {c.key: c.view(self.memory, 0).astype(c.dtype) for c in self.columns}
+            return {**columns, **masks}
         message = m.unpack([bytes(self.memory[:length])])
         self.columns = columns_of(message.value)
         return message.value

@@ -19,8 +19,8 @@ in the message area, and its answer fills a slot of an observation slab that bel
 
 Infos travel as columns, without the codec, while each step has the same small dict. If a step's
 infos are flat and numeric, both sides derive the same columns from the last *encoded* infos. As
-long as later infos have that schema, the jail writes only their numbers. Offsets and schemas never
-come from the jail.
+long as later infos have that schema, the jail writes only their numbers. Their masks are all true
+and made by the client. Offsets and schemas never come from the jail.
 """
 
 from __future__ import annotations

@@ -227,13 +227,15 @@ def test_they_are_joined_as_parts_are() -> None:
         assert not np.shares_memory(found[key], joined.infos()[key])
 
 
-def test_what_is_no_boolean_in_a_mask_is_true() -> None:
-    schemas = [schema(infos(3, 0)), schema(infos(2, 0))]
+def test_bytes_of_a_mask_are_not_read_and_any_but_zero_are_true_in_a_value() -> None:
+    parts = [infos(3, 0, done=np.ones(3, bool)), infos(2, 0, done=np.ones(2, bool))]
+    schemas = [schema(part) for part in parts]
     for column, view in schemas[1]:
-        if column.key == "_speed":
-            view.view(np.uint8)[...] = (2, 0)
-    found = JoinedColumns(schemas, BOUNDS).infos()["_speed"]
-    assert found.view(np.uint8).tolist() == [1, 1, 1, 1, 0]
+        if column.dtype == np.bool_:
+            view[...] = (2, 0)
+    joined = JoinedColumns(schemas, BOUNDS).infos()
+    assert joined["done"].view(np.uint8).tolist() == [1, 1, 1, 1, 0]
+    assert joined["_done"].view(np.uint8).tolist() == [1] * 5
 
 
 @pytest.mark.parametrize(
