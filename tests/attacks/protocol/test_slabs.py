@@ -27,7 +27,7 @@ from envhub_worker.protocol.shared_memory.packets import packet_bytes, write_pac
 
 pytestmark = pytest.mark.short
 WAIT_S = 60
-SLOT = 1 << 16
+SLOT = 1 << 17
 Asked = tuple[SlotRing, LaneShard]
 
 
@@ -375,6 +375,9 @@ def test_columns_of_a_step_are_numbers_and_texts_of_its_form(
 
 FLAGS = spaces.Sequence(spaces.MultiBinary(2))
 WORDS = spaces.OneOf([spaces.Sequence(spaces.Text(9)), spaces.Graph(spaces.Box(-1, 1, (2,)), None)])
+PAIRS = spaces.Sequence(spaces.Tuple([spaces.MultiBinary(1)] * 2))
+MANY = slabs.INFO_BYTES // 4
+"""So many pairs in each of two members are as many items as there may be, though more would fit."""
 _INT8, _BOOL = [slabs.DTYPE_CODES[np.dtype(kind)] for kind in (np.int8, np.bool_)]
 
 
@@ -388,7 +391,7 @@ _INT8, _BOOL = [slabs.DTYPE_CODES[np.dtype(kind)] for kind in (np.int8, np.bool_
         (FLAGS, [-1, 4, _INT8], "", "negative size"),
         (FLAGS, [2, slabs.INFO_BYTES, _INT8], "", "more items"),
         (FLAGS, [2, 2**62, _INT8], "", "more items"),
-        (FLAGS, [2, SLOT // 2, _INT8], "", "larger than its slot"),
+        (FLAGS, [2, slabs.INFO_BYTES - 2, _INT8], "", "more items"),
         (FLAGS, [2], "", "fewer sizes"),
         (FLAGS, [2, 1, _INT8, 0], "", "other sizes"),
         (FLAGS, [2, 1, _INT8], "x", "other sizes"),
@@ -399,7 +402,9 @@ _INT8, _BOOL = [slabs.DTYPE_CODES[np.dtype(kind)] for kind in (np.int8, np.bool_
         (WORDS, [-1, 0, 0, 1, 0, -4, 0, 0, 0], "word", "negative size"),
         (WORDS, [-1, 0, 0, 1, 2**62, 4], "word", "fewer sizes"),
         (WORDS, [-1, 1, 1, _INT8, -2, 0], "", "negative size"),
-        (WORDS, [-1, 1, 1, _INT8, 2**62, 2**62], "", "larger than its slot"),
+        (WORDS, [-1, 1, 1, _INT8, 2**62, 2**62], "", "more items"),
+        (PAIRS, [MANY, MANY, _INT8, _INT8], "", ""),
+        (PAIRS, [MANY, MANY + 1, _INT8, _INT8], "", "more items"),
     ],
 )
 def test_sizes_of_members_that_vary_are_read_within_what_there_is(
@@ -407,7 +412,7 @@ def test_sizes_of_members_that_vary_are_read_within_what_there_is(
 ) -> None:
     """Of two members; the cases without a refusal are the controls."""
     ring, shard = asked
-    sample = ((np.ones(2, np.int8),), ()) if space is FLAGS else ((0, ("a",)), (0, ()))
+    sample: Any = ((0, ("a",)), (0, ())) if space is WORDS else ((), ())
     flags = np.zeros(2, np.bool_)
     step = m.StepDone(sample, np.zeros(2), flags, flags, {})
     columns, packet = (
@@ -435,6 +440,8 @@ def test_sizes_of_members_that_vary_are_read_within_what_there_is(
     assert isinstance(answer, m.StepDone)
     if space is WORDS:
         assert answer.observation == ((0, ("word",)), (0, ()))
+    elif space is PAIRS:
+        assert list(map(len, answer.observation)) == [MANY, MANY]
     else:
         byte = 1 if numbers[-1] == _BOOL else 2
         members = [[row.tobytes() for row in member] for member in answer.observation]

@@ -35,7 +35,7 @@ from envhub_worker.protocol.spaces.batches import APART_CLASSES
 _MAX_PARTS = 1024
 _PLAIN = frozenset({float, int, bool, str})
 _AS_TUPLES = (tuple.__iter__, tuple.__len__)
-New = tuple[list[Any], list[Any], list[Any]]
+New = tuple[list[Any], list[Any], list[ragged.Items]]
 """Scalars and arrays of new results, in the order of the columns, and arrays of varying sizes."""
 _Take = Callable[[Any, New], None]
 """Adds the scalars and arrays of a part; raises ``IrregularError``: it has another form."""

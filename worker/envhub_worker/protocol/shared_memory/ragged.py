@@ -32,8 +32,11 @@ _STACKED = (*ARRAY_SPACES, spaces.Dict, spaces.Tuple)
 _PYTHON_INTS = -1
 _MISSING = -1
 _MOST = INFO_BYTES
-"""Items in one batch, each of which becomes an object of its own."""
+"""Items in one slot that have no number of their own. Each becomes an array, which takes a hundred
+bytes and more, for a single byte in the slot."""
 Copy = Callable[[], Any]
+Items = tuple[Array, int]
+"""An array, and the number of items that it is read as."""
 
 
 class ArrayArea:
@@ -51,27 +54,30 @@ class ArrayArea:
     def __init__(self, memory: Any, start: int, room: int, used: int, slot: Any = None) -> None:
         self._memory, self._start, self._room, self._slot = memory, start, room, slot
         self.used = used
+        self._items = 0
 
-    def _next(self, nbytes: int) -> int:
+    def _next(self, nbytes: int, items: int) -> int:
+        # all arrays are counted together: a space may name very many
         offset, self.used = self.used, self.used + -(-nbytes // LINE) * LINE
-        return offset if self.used <= self._room else -1
+        self._items += items
+        return offset if self.used <= self._room and self._items <= _MOST else -1
 
-    def write(self, arrays: Sequence[Array]) -> None:
+    def write(self, arrays: Sequence[Items]) -> None:
         """Write arrays. Raises ``IrregularError``: there is no room for all of them."""
-        offsets = [self._next(array.nbytes) for array in arrays]
+        offsets = [self._next(array.nbytes, items) for array, items in arrays]
         if -1 in offsets:
             raise IrregularError
-        for offset, array in zip(offsets, arrays, strict=True):
+        for offset, (array, _) in zip(offsets, arrays, strict=True):
             np.ndarray(array.shape, array.dtype, self._memory, self._start + offset)[...] = array
 
-    def read(self, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-        """The next array, which belongs to the caller. Trust: its length is input from the worker.
+    def read(self, dtype: np.dtype[Any], shape: tuple[int, ...], items: int) -> Array:
+        """The next array, which belongs to the caller. Trust: its length and the number of
+        ``items`` are input from the worker.
         Raises ``RemoteProtocolError``: the slot has no room for it.
         """
-        nbytes = math.prod(shape) * dtype.itemsize
-        offset = self._next(nbytes)
+        offset = self._next(math.prod(shape) * dtype.itemsize, items)
         if offset < 0:
-            raise RemoteProtocolError("the worker wrote sizes that are larger than its slot")
+            raise RemoteProtocolError("the worker wrote more items than its slot has room for")
         if self._slot is not None and is_lent(shape, dtype):
             borrowed: Array = np.ndarray(shape, dtype, self._slot, offset)
             return borrowed
@@ -98,7 +104,7 @@ class Written:
     def __init__(self) -> None:
         self.numbers: list[int] = []
         self.texts: list[str] = []
-        self.arrays: list[Array] = []
+        self.arrays: list[Items] = []
 
 
 class Received:
@@ -118,11 +124,11 @@ class Received:
             raise RemoteProtocolError("the worker wrote fewer sizes than its members have")
         return self._numbers[start : self._next]
 
-    def array(self, code: int, shape: tuple[int, ...]) -> Array:
+    def array(self, code: int, shape: tuple[int, ...], items: int) -> Array:
         """The next array, of the dtype with this code."""
         if not 0 <= code < len(ACTION_DTYPES):
             raise RemoteProtocolError("the worker wrote an unknown dtype")
-        return self._arrays.read(ACTION_DTYPES[code], shape)
+        return self._arrays.read(ACTION_DTYPES[code], shape, items)
 
     def texts(self, count: int) -> list[str]:
         """The next texts."""
@@ -217,19 +223,16 @@ def _rows(shape: tuple[int, ...]) -> tuple[Write, Read]:
     def write(members: Sequence[Any], written: Written) -> None:
         if not members:
             return
-        _check(len(members) <= _MOST)
         _check(_classes(members) == {np.ndarray} and {*map(len, members)} == {first})
         joined = _joined(members, row)
         written.numbers.append(DTYPE_CODES[joined.dtype])
-        written.arrays.append(joined)
+        written.arrays.append((joined, len(members)))
 
     def read(count: int, received: Received) -> list[Any]:
         if not count:
             return []
-        if count > _MOST:
-            raise RemoteProtocolError("the worker wrote more items than there may be")
         [code] = received.numbers(1)
-        return list(received.array(code, (count, *shape)))
+        return list(received.array(code, (count, *shape), count))
 
     return write, read
 
@@ -249,7 +252,7 @@ def _arrays(row: tuple[int, ...], *, optional: bool = False) -> tuple[Write, Rea
             _check(_classes(arrays) == {np.ndarray})
             joined = _joined(arrays, row)
             code = DTYPE_CODES[joined.dtype]
-            written.arrays.append(joined)
+            written.arrays.append((joined, 0))
         written.numbers.append(code)
         written.numbers += lengths
 
@@ -260,7 +263,7 @@ def _arrays(row: tuple[int, ...], *, optional: bool = False) -> tuple[Write, Rea
             raise RemoteProtocolError("the worker wrote a negative size")
         rows = lengths if fewest >= 0 else [max(length, 0) for length in lengths]
         bounds = [*accumulate(rows, initial=0)]
-        joined = received.array(code, (bounds[-1], *row))
+        joined = received.array(code, (bounds[-1], *row), 0)
         parts = [joined[start:stop] for start, stop in pairwise(bounds)] if count != 1 else [joined]
         if fewest < 0:
             return [None if n < 0 else part for n, part in zip(lengths, parts, strict=True)]
@@ -371,7 +374,7 @@ def _choices(parts: list[tuple[Write, Read]]) -> tuple[Write, Read]:
     return write, read
 
 
-def write_members(write: Write, count: int, batch: Any) -> tuple[bytes, str, list[Array]]:
+def write_members(write: Write, count: int, batch: Any) -> tuple[bytes, str, list[Items]]:
     """A batch of ``count`` members as numbers, all texts as one text, and arrays.
     Raises ``IrregularError``: this is another batch.
     """
