@@ -277,9 +277,9 @@ class ShardSlabs:
         ``space``: as for ``StepColumns``.
         """
         kind, length = self._tells[slabs.OUTCOME], self._tells[slabs.LENGTH]
+        slots, self._form = self._answer_slots, None
         if kind == slabs.FETCH:
             return None
-        slots, self._form = self._answer_slots, None
         area = self._answers if slots is None else slots.bytes_of_chosen()
         if kind == slabs.COLUMNS and slots is not None:
             return m.StepDone(*self._step_of_columns(length, slots))

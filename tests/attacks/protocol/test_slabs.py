@@ -373,6 +373,26 @@ def test_columns_of_a_step_are_numbers_and_texts_of_its_form(
         assert answer.observation.tobytes() == b"\x02" * 16
 
 
+@pytest.mark.parametrize("compared", [True, False], ids=["control", "interrupted"])
+def test_a_form_is_checked_before_it_is_trusted(asked: Asked, compared: bool) -> None:
+    """Also if a Ctrl-C came before the comparison, and the next answer goes over the server."""
+    ring, shard = asked
+    flags = np.zeros(2, np.bool_)
+    step = m.StepDone(np.zeros(2), np.zeros(2), flags, flags, {})
+    packet = _packet(*map(bytes, m.pack(step)))
+    digest = StepColumns(m.values_of(step), SLOT).digest
+    os.pwrite(ring.fd, packet, 0)
+    for words in ((slabs.DONE, len(packet), digest), (slabs.FETCH, 0, 0), (slabs.COLUMNS, 0, 0)):
+        told = struct.pack("QQQ", *words)
+        attack(shard, f"os.pwrite(reply, {told!r}, {slabs.OUTCOME * 8})")
+        trusted = shard.checked_step()
+        if words[0] != slabs.COLUMNS:
+            shard.answer()
+            if compared or words[0] == slabs.FETCH:
+                shard.note_checked(False)
+    assert (trusted is not None) is compared
+
+
 FLAGS = spaces.Sequence(spaces.MultiBinary(2))
 WORDS = spaces.OneOf([spaces.Sequence(spaces.Text(9)), spaces.Graph(spaces.Box(-1, 1, (2,)), None)])
 PAIRS = spaces.Sequence(spaces.Tuple([spaces.MultiBinary(1)] * 2))
