@@ -165,7 +165,9 @@ class Spawner:
     def _died(self) -> list[SpawnerEvent]:
         self._exited = True
         code = self._reap_zygote()
-        log = self._process.log.read_bytes()[-_LOG_TAIL_BYTES:].decode(errors="replace")
+        log = ""
+        with contextlib.suppress(OSError):  # no descriptor is left: the events are needed anyway
+            log = self._process.log.read_bytes()[-_LOG_TAIL_BYTES:].decode(errors="replace")
         events: list[SpawnerEvent] = [ZygoteDied(code, log)]
         events += [JailExited(jail, None, int(signal.SIGKILL)) for jail in self._jails.values()]
         self._release_jails()

@@ -86,6 +86,12 @@ class ZygoteProcess:
                 start_new_session=True,
             )
         self.pid = self._process.pid
+        self._pidfd = -1
+        try:  # now: when the process ends, there may be no descriptor left
+            self._pidfd = os.pidfd_open(self.pid)
+        except OSError:
+            self.discard()
+            raise
 
     def serves(self, runtime: Runtime, granted: Mapping[str, str]) -> bool:
         """Whether the process was started with the arguments that these jails need."""
@@ -95,17 +101,21 @@ class ZygoteProcess:
 
     def wait(self) -> int:
         """Returns the exit code; kills the process if it does not end soon."""
-        if self._process.poll() is None:
-            pidfd = os.pidfd_open(self.pid)
-            if not ends_within(pidfd, _END_S):
-                self._process.kill()
-            os.close(pidfd)
-        return self._process.wait()
+        if self._process.poll() is None and not ends_within(self._pidfd, _END_S):
+            self._process.kill()
+        return self._reaped()
+
+    def _reaped(self) -> int:
+        code = self._process.wait()
+        if self._pidfd >= 0:
+            os.close(self._pidfd)
+            self._pidfd = -1
+        return code
 
     def discard(self) -> None:
         """End the process unused."""
         self.channel.close()
         self._process.kill()
-        self._process.wait()
+        self._reaped()
         self.log.unlink(missing_ok=True)
         self.folder.rmdir()
