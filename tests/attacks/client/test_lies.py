@@ -286,7 +286,7 @@ def test_contradictory_manifest_does_no_harm(liar: LyingServer, folder: str, wha
         assert len(suites.env.step(suites.env.action_space.sample())) == 5
 
 
-def test_errors_about_spaces_do_not_paint(liar: LyingServer, folder: str) -> None:
+def test_spaces_and_errors_about_them_do_not_paint(liar: LyingServer, folder: str) -> None:
     """Gymnasium prints the characters of a Text as they are, which is the control."""
     single = spaces.Text(9, charset=ESCAPES)
     assert paints(str(single))
@@ -303,6 +303,9 @@ def test_errors_about_spaces_do_not_paint(liar: LyingServer, folder: str) -> Non
             refuses(lambda: env.step(3)),
             refuses(lambda: env.step(["x"])),
         ]
+        shown = [env.single_action_space, env.action_space, env.single_observation_space]
+        assert env.single_action_space == single
+        assert not any(map(paints, map(str, shown)))
     assert [type(error) for error in errors] == [RemoteProtocolError, UniterableError, ActionError]
     assert not any(paints(str(error)) for error in errors)
 

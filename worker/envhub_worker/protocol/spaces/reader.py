@@ -22,6 +22,7 @@ from envhub_worker.protocol.spaces.spaces import (
     INTEGER_DTYPES,
     MAX_SPACE_DEPTH,
     NUMBER,
+    EscapedText,
     OneOf,
     OpaqueSpace,
     is_charset,
@@ -275,9 +276,8 @@ def _read_text(reader: SpaceReader, shortest: object, longest: object, character
     reader.spend(CHARACTER_BYTES * len(characters))
     most = _integer(longest, 0, MAX_INT64)
     reader.spend(most * ELEMENT_BYTES)  # it is a text of so many characters that is drawn
-    return spaces.Text(
-        max_length=most, min_length=_integer(shortest, 0, MAX_INT64), charset=characters
-    )
+    kind = spaces.Text if characters.isprintable() else EscapedText
+    return kind(max_length=most, min_length=_integer(shortest, 0, MAX_INT64), charset=characters)
 
 
 def _read_dict(reader: SpaceReader, keys: object, parts: object, sort_keys: object) -> Space:

@@ -108,6 +108,13 @@ class OpaqueSpace(gym.Space[Any]):
         )
 
 
+class EscapedText(spaces.Text):
+    """A Text of the peer with control characters, which Gymnasium would print as they are."""
+
+    def __repr__(self) -> str:
+        return f"Text({self.min_length}, {self.max_length}, charset={self.characters!r})"
+
+
 def is_shape(value: object) -> TypeGuard[tuple[int, ...]]:
     """Says whether this is a tuple of sizes that numpy can take."""
     return (
