@@ -2,8 +2,7 @@
 
 The first sub-environment that has a key decides how its values are joined, so only the client can
 join the infos of several shards. A shard's infos are columns if these lose nothing, else each has
-its own place: see ``flat_infos`` and ``own_infos`` in ``protocol/spaces/batches``. Beside them may
-be marks, such as that a sub-environment was restarted: arrays with masks.
+its own place: see ``flat_infos`` and ``own_infos`` in ``protocol/spaces/batches``.
 Trust: input from the worker; it is used within ``UNTRUSTED``.
 """
 
@@ -70,9 +69,7 @@ def _columns_of_all(parts: Sequence[Infos], sizes: Sequence[int]) -> Infos | Non
 def _joined_columns(parts: Sequence[Infos], sizes: Sequence[int], classes: Any) -> Infos | None:
     _refuse_unless(all(type(each) is dict for each in (classes, *parts)), "of a known form")
     keys = [*parts[0]]
-    if {*keys} != {name for key in classes for name in (key, f"_{key}")}:  # there are marks
-        return None
-    if any([*part] != keys for part in parts):
+    if {*keys} != _names(classes) or any([*part] != keys for part in parts):
         return None
     joined: Infos = {}
     for key in keys:
@@ -100,16 +97,22 @@ def each_of(part: Infos, size: int) -> OwnInfos:
     classes, forms = part.get(batches.APART_CLASSES, {}), part.get(batches.APART_FORMS, {})
     _refuse_unless(type(classes) is type(forms) is dict, "of a known form")
     _refuse_unless_few(_count(classes) * size)
+    places = part.keys() - _names(classes)
+    _refuse_unless(all(type(key) is int for key in places), "one mapping each")
     if classes:
         for some, row in zip(own, _rows(part, classes, size), strict=True):
             some.append((row, {}))
-    for place in sorted(key for key in part if type(key) is int and key >= 0):
+    for place in sorted(key for key in places if key >= 0):
         info, form = part[place], forms.get(place, {})
         _refuse_unless(type(info) is dict and place < 2 * size, "one mapping each")
         _refuse_unless(batches.are_forms(form), "of a known form")
         own[place % size].append((info, form))
-    _add_marks(own, part, classes, size)
     return own
+
+
+def _names(classes: Infos) -> set[Any]:
+    """The keys of columns, and of their masks."""
+    return {name for key in classes for name in (key, f"_{key}")}
 
 
 def _count(classes: Any) -> int:
@@ -135,28 +138,6 @@ def _members(column: Any, has_numpys: Any, size: int) -> Any:
 def _refuse_unless_column(value: Any, size: int) -> None:
     is_column = type(value) is np.ndarray and value.shape[:1] == (size,)
     _refuse_unless(is_column and value.dtype.kind in _NUMBERS, "one value each")
-
-
-def _add_marks(own: OwnInfos, part: Infos, classes: Infos, size: int) -> None:
-    marks: list[Infos] = [{} for _ in own]
-    marked = 0
-    for key in part:
-        if type(key) is int:
-            continue
-        is_mask = type(key) is str and key[:1] == "_" and key[1:] in part
-        _refuse_unless(is_mask or (type(key) is str and f"_{key}" in part), "one mapping each")
-        if not is_mask and key not in classes:
-            marked += size
-            _refuse_unless_few(marked)
-            mask = part[f"_{key}"]
-            _refuse_unless_column(mask, size)
-            _refuse_unless(mask.ndim == 1, "one value each")
-            for row in np.flatnonzero(mask):
-                marks[row][key] = True
-    for index, mark in enumerate(marks):
-        if mark:
-            *others, (info, form) = own[index] or [({}, {})]
-            own[index] = [*others, ({**info, **mark}, form)]
 
 
 def _refuse_unless_few(values: int, value_bytes: int = _VALUE_BYTES) -> None:

@@ -23,6 +23,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.lifecycle import Event
+from envhub_worker.protocol.spaces import batches
 
 if TYPE_CHECKING:
     from envhub_sandbox.transport.jail import Request
@@ -222,10 +223,11 @@ class Recovery:
     def _revived(self, index: int, operation: str, answer: m.Message) -> m.Message:
         """A dead shard's reply, from its new runner's answer. Trust: input from the worker."""
         start, stop = self._bounds[index]
+        unjoined = self._lease.results.come_unjoined
         if operation == "step":
-            return revived_step(typed_reply(answer, m.StepDone), stop - start)
+            return revived_step(typed_reply(answer, m.StepDone), stop - start, unjoined=unjoined)
         done = typed_reply(answer, m.ResetDone)
-        return m.replace(done, info=mark_revived(done.info, stop - start))
+        return m.replace(done, info=mark_revived(done.info, stop - start, unjoined=unjoined))
 
 
 def _target_of(messages: Sequence[m.Message]) -> tuple[Any, ...] | None:
@@ -244,7 +246,7 @@ def _target_of(messages: Sequence[m.Message]) -> tuple[Any, ...] | None:
     return (args[0], calls[0].name, *targets)
 
 
-def revived_step(reply: m.StepDone, count: int) -> m.StepDone:
+def revived_step(reply: m.StepDone, count: int, *, unjoined: bool = False) -> m.StepDone:
     """The rows of a restarted shard for the step in which it died. Trust: its flags are not used.
 
     The shape of its rewards is used only if they are an array, which took that many bytes to send:
@@ -256,14 +258,26 @@ def revived_step(reply: m.StepDone, count: int) -> m.StepDone:
         np.zeros(rewards.shape if is_batch(rewards) else (count,)),
         np.zeros(count, np.bool_),
         np.ones(count, np.bool_),
-        mark_revived(reply.info, count),
+        mark_revived(reply.info, count, unjoined=unjoined),
     )
 
 
-def mark_revived(info: dict[Any, Any], count: int) -> dict[Any, Any]:
-    """The infos of a shard's ``count`` sub-environments, marked as restarted."""
+def mark_revived(info: dict[Any, Any], count: int, *, unjoined: bool) -> dict[Any, Any]:
+    """The infos of a shard's ``count`` sub-environments, marked as restarted.
+    ``unjoined``: whether they are columns with their classes, or each sub-environment's own.
+    """
     yes = np.ones(count, np.bool_)
-    return {**info, RESTARTED: yes, f"_{RESTARTED}": yes.copy()}
+    marked = {**info, RESTARTED: yes, f"_{RESTARTED}": yes.copy()}
+    if not unjoined:
+        return marked
+    if batches.APART_CLASSES in info:
+        marked[batches.APART_CLASSES] = {**info[batches.APART_CLASSES], RESTARTED: False}
+        return marked
+    own = info.copy()
+    for index in range(count):
+        place = index + count if index + count in info else index
+        own[place] = {**info.get(place, {}), RESTARTED: True}
+    return own
 
 
 # --- seeds for the fresh runner of a dead shard --------------------------------------------------

@@ -105,9 +105,8 @@ def _columns(keys: int, value: np.ndarray, *, is_numpys: bool = True) -> dict[An
     [
         _columns(30_000, np.zeros((COUNT, 0))),
         _columns(1, np.zeros((COUNT, 30_000), np.int8), is_numpys=False),
-        {f"{mark}{key}": np.ones(COUNT, bool) for key in range(3_000) for mark in ("", "_")},
     ],
-    ids=["empty arrays", "numbers of Python", "marks"],
+    ids=["empty arrays", "numbers of Python"],
 )
 def test_columns_take_no_more_memory_than_their_message_may(lie: dict[Any, Any]) -> None:
     """In the client each value of a row is an object. The control is joined."""
