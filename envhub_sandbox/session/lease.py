@@ -21,6 +21,7 @@ from envhub_sandbox.errors import (
     ServerBusyError,
     WorkerDiedError,
     WorkerError,
+    WorkerTimeoutError,
 )
 from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.sandbox import is_draining, is_unanswered, retry_while_busy
@@ -28,6 +29,8 @@ from envhub_sandbox.session.builder import Builder, JailSource
 from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.launcher import LoadedJail
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.log import warn_caller
 from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.replies import UnreachableError
@@ -290,13 +293,22 @@ class Lease:
                 self._close_lane()
 
     def close_politely(self) -> None:
-        """Have the repository's own ``close`` run, within ``close_s``, and ignore its errors."""
+        """Have the repository's own ``close`` run, within ``close_s``; the runner warns if it
+        raises.
+        """
         lane, deadline = self.lane, Deadline(self.repository.timeouts.close_s)
         if lane is None:
             return
         packed = lane.jail.pack(m.Close(lane.number))
-        with contextlib.suppress(EnvHubError):
+        try:
             lane.jail.ask("close", [(runner, packed) for runner in lane.runners], deadline)
+        except WorkerTimeoutError:
+            seconds = deadline.timeout_s
+            longer = option_name("close_s", 2 * (seconds or 1))
+            text = f"{self.repository.label}: its close was ended after {seconds} s"
+            warn_caller(f"{text}; {longer} waits longer", RuntimeWarning)
+        except EnvHubError:
+            pass
 
     def note_steps(self) -> None:
         """Remember the mean time of a step, for the next use of the same commit."""

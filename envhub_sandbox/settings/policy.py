@@ -43,7 +43,7 @@ class Timeouts:
         reset_s: One ``reset``.
         step_s: One ``step``.
         call_s: One ``call``, ``get_attr``, ``set_attr`` or ``render``.
-        close_s: The environment's own ``close``; afterwards its processes are killed.
+        close_s: The environment's own ``close``; then its processes are killed, with a warning.
         idle_s: Between two requests. Then its processes are ended, and the next ``reset`` starts
             new ones; any other request raises an error. None never ends them.
         server_idle_s: How long the worker server, or the container, waits for the next environment

@@ -1,6 +1,7 @@
 """What a sub-environment warns of reaches the caller as it does from ``SyncVectorEnv``."""
 
 import re
+import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -136,3 +137,37 @@ def test_a_filter_may_make_an_error_of_it(way: str) -> None:
         assert env.step(np.array([1, 0]))[0].tolist() == [[1, 1], [0, 0]]
     assert env.sandbox.stats()["state"] == "READY"
     env.close()
+
+
+class Raising(Warner):
+    """Fails to close."""
+
+    def close(self) -> None:
+        """Raise."""
+        raise ValueError("not saved")
+
+
+class Hanging(Warner):
+    """Never ends its close."""
+
+    def close(self) -> None:
+        """Wait for what never comes."""
+        threading.Event().wait()
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(
+    ("env_fn", "text"),
+    [(Raising, "its close raised ValueError: not saved"), (Hanging, "close was ended after 0.5 s")],
+)
+def test_a_close_that_fails_is_told(way: str, env_fn: Any, text: str) -> None:
+    close_s = 0.5 if env_fn is Hanging else 60.0
+    options = {**WAYS[way].get("options", {}), "timeouts": {"close_s": close_s}}
+    env = vector([env_fn] * 2, **{**WAYS[way], "options": options})
+    with listening() as told:
+        env.reset()
+        told.clear()
+        env.close()
+        env.close()
+    assert [category for category, _ in told] == ["RuntimeWarning"]
+    assert text in told[0][1]

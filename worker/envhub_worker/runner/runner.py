@@ -12,6 +12,8 @@ import itertools
 import os
 import select
 import socket
+import traceback
+import warnings
 from array import array
 from collections.abc import Callable, Collection, Iterator
 from functools import partial
@@ -427,7 +429,11 @@ class Runner:
         if request.env in self.lanes:
             self.forget_lane(self.lanes[request.env])
         if env is not None:
-            env.close()
+            try:
+                env.close()
+            except BaseException as error:  # the environment is closed nevertheless
+                told = traceback.format_exception_only(type(error), error)[-1].strip()
+                warnings.warn(f"its close raised {told}", RuntimeWarning, stacklevel=2)
         return m.Value(None)
 
 
