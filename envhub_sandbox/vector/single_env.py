@@ -112,7 +112,8 @@ class SingleEnv(gym.Env[Any, Any]):
         if begun is not None and seed is None and not options:
             return begun
         if self._apart is not None:
-            batch, infos = self._apart.reset(seed, options)
+            seeds = None if seed is None else [seed]  # a list of seeds is no seed
+            batch, infos = self._apart.reset(seeds, options)
             self._follow_spaces()
         else:
             batch, infos = self._vector.reset(seed=seed, options=options)

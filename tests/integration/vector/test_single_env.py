@@ -96,7 +96,8 @@ class Told(gym.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.steps = 0
-        return self.seen(), {"begun": True, "level": self._level, **(options or {})}
+        begun = {"begun": True, "level": self._level, "seed": seed}
+        return self.seen(), {**begun, **(options or {})}
 
     def seen(self):
         step = self.steps
@@ -144,7 +145,9 @@ def env(folder: Path, request: pytest.FixtureRequest) -> Iterator[Any]:
 
 
 def _played(env: gym.Env[Any, Any]) -> list[Any]:
-    seen: list[Any] = [env.reset(seed=1)]
+    with pytest.raises(gym.error.Error):
+        env.reset(seed=[1])  # type: ignore[arg-type]
+    seen: list[Any] = [env.reset(seed=True)]
     for _ in range(2):
         seen += [env.step(np.int64(1) if step % 2 else 1) for step in range(7)]
         # the episode that has ended is shown until the caller resets it, also by a step
