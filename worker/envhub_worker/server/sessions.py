@@ -46,10 +46,9 @@ class Session:
     connections: OrderedDict[tuple[bytes, bytes], Connection] = field(default_factory=OrderedDict)
     since: float = field(default_factory=time.monotonic)
 
-    @property
-    def owner(self) -> bytes:
-        """The mark of the session's jails, which no client with another key can have."""
-        return self.key + self.name
+    def __post_init__(self) -> None:
+        # The mark of the session's jails, which no client with another key can have.
+        self.owner = self.key + self.name
 
 
 class Sessions:
@@ -98,10 +97,11 @@ class Sessions:
 
     def find(self, identity: bytes, key: bytes) -> Session | None:
         """Returns the session of a connection whose message has just come."""
-        session = self._of.get((identity, key))
+        connection = identity, key
+        session = self._of.get(connection)
         if session is not None:
             session.heard = self._clock()
-            session.connections.move_to_end((identity, key))
+            session.connections.move_to_end(connection)
         return session
 
     def agree(self, identity: bytes, key: bytes, compression: str) -> None:

@@ -99,7 +99,9 @@ class JailEvents:
         assert link.slabs is not None
         link.sent += len(frame)
         link.slabs.ask(frame, owner)
-        self._steps.owe(link.slabs, self._guarded(entry, partial(self._stepped, entry, link)))
+        if link.take is None:
+            link.take = self._guarded(entry, partial(self._stepped, entry, link))
+        self._steps.owe(link.slabs, link.take)
 
     def _stepped(self, entry: JailRecord, link: RunnerLink) -> None:
         """Take a runner's answer to a step, if there is one. Its request may be gone by now."""
@@ -144,7 +146,7 @@ class JailEvents:
         if len(replies) == len(pending.replies):
             payload = [frame for frames in replies for frame in frames]
             counts = tuple(map(len, replies))
-            dead = tuple(sorted(pending.dead))
+            dead = tuple(sorted(pending.dead)) if pending.dead else ()
             self._reply(pending.asker, m.RelayDone(counts, dead), payload)
 
     def _read_output(self, entry: JailRecord) -> None:

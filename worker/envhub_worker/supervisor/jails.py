@@ -42,7 +42,6 @@ from envhub_worker.supervisor.records import (
     RefusedError,
     Reply,
     Witness,
-    owes,
     status_of,
     whole_jail,
 )
@@ -207,9 +206,12 @@ class Jails:
         # Every target is checked before the first is sent anything. A request that is refused half
         # way would leave answers behind that nobody expects.
         for runner, frames in targets:
-            if request.stepped and not _can_step(entry.links.get(runner), frames):
+            link = entry.links.get(runner)
+            if link is None:  # it has died, and its death is the answer
+                continue
+            if request.stepped and not _can_step(link, frames):
                 raise RefusedError("LocalProtocolError", "a runner has no slabs, or owes a step")
-            if owes(entry, runner) >= MAX_IN_FLIGHT:
+            if link.unanswered >= MAX_IN_FLIGHT:
                 raise RefusedError("WorkerError", f"a runner owes {MAX_IN_FLIGHT} answers already")
         pending = Pending(asker, request.operation, [None] * len(targets))
         for index, (runner, frames) in enumerate(targets):
@@ -249,7 +251,7 @@ class Jails:
             if runner not in entry.links or runner in pending:
                 raise RefusedError("LocalProtocolError", f"no runner {runner}, or named twice")
             pending.add(runner)
-            if owes(entry, runner):
+            if entry.links[runner].unanswered:
                 raise RefusedError("LocalProtocolError", f"runner {runner} owes an answer")
             if not words.served(leaves, request_bytes, observation_bytes, most):
                 raise RefusedError("WorkerError", f"the sizes of slabs are out of range: {part}")
@@ -417,10 +419,7 @@ def _note_limits(entry: JailRecord, usage: dict[str, int]) -> None:
             entry.denied.insert(0, f"limit {name}")
 
 
-def _can_step(link: RunnerLink | None, frames: list[bytes]) -> bool:
-    """Whether a runner accepts a step. A dead runner does: its death is the answer."""
-    if link is None:
-        return True
+def _can_step(link: RunnerLink, frames: list[bytes]) -> bool:
     slabs = link.slabs
     return slabs is not None and slabs.owner is None and len(frames) == 1 and slabs.fits(frames[0])
 

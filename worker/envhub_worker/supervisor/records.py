@@ -271,12 +271,6 @@ def waiting(entry: JailRecord) -> list[Pending]:
     return list(states.values())
 
 
-def owes(entry: JailRecord, runner: int) -> int:
-    """Returns how many requests a runner has not answered; 0 if it has died."""
-    link = entry.links.get(runner)
-    return 0 if link is None else len(link.owed)
-
-
 def whole_jail(reason: Reason, **how: Any) -> m.Death:
     """Returns the death of a whole jail; ``how`` are further fields of ``Death``."""
     return m.Death(-1, reason, **how)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import collections
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -25,6 +25,7 @@ class RunnerLink:
         pending: The owners of unanswered requests by id, the oldest first.
         watched: Whether the loop watches the stream for writing.
         slabs: The slabs by which the server steps the runner, or None.
+        take: Takes the answer to such a step; made for the first one.
     """
 
     sock: socket.socket
@@ -32,6 +33,7 @@ class RunnerLink:
     pending: collections.OrderedDict[int, Any] = field(default_factory=collections.OrderedDict)
     watched: bool = False
     slabs: ServedSlabs | None = None
+    take: Callable[[], None] | None = None
     sent: int = 0  # bytes; after the end ``JailRecord.moved`` has them
     received: int = 0  # likewise
     # Requests that the socket has not taken yet; the first may be sent in part.
@@ -44,6 +46,11 @@ class RunnerLink:
     def fileno(self) -> int:
         """The stream's descriptor."""
         return self.sock.fileno()
+
+    @property
+    def unanswered(self) -> int:
+        """How many requests the runner has not answered."""
+        return len(self.pending) + (self.slabs is not None and self.slabs.owner is not None)
 
     @property
     def owed(self) -> list[Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass as mutable_dataclass
 from dataclasses import field
@@ -161,17 +160,17 @@ def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
 class InFlight:
     """The bytes of unanswered requests, by key."""
 
-    _of: Counter[bytes] = field(default_factory=Counter)
+    _of: dict[bytes, int] = field(default_factory=dict)
     _requests: dict[tuple[bytes, int], tuple[Asker, bytes, int]] = field(default_factory=dict)
 
     def of(self, key: bytes) -> int:
         """Returns the bytes in flight of a key."""
-        return self._of[key]
+        return self._of.get(key, 0)
 
     def add(self, key: bytes, asker: Asker, size: int, quota: int) -> None:
         """Count a request until it is answered. Raises ``RefusedError``."""
-        taken = self._of[key]
-        if (asker.identity, asker.request_id) in self._requests:
+        taken, request = self._of.get(key, 0), (asker.identity, asker.request_id)
+        if request in self._requests:
             raise RefusedError("LocalProtocolError", "a request with this id is not answered yet")
         if taken + size > quota:
             text = (
@@ -183,7 +182,7 @@ class InFlight:
                 raise RefusedError("WorkerError", text)
             raise BusyError(Busy("inflight", taken, quota, RETRY_S), text)
         self._of[key] = taken + size
-        self._requests[asker.identity, asker.request_id] = asker, key, size
+        self._requests[request] = asker, key, size
 
     def answered(self, asker: Asker) -> None:
         """Stop counting a request. Another one may have used the same id before."""
