@@ -98,11 +98,20 @@ class StepDeadline(Deadline):
     ``running``: whether it counts already; the caller sets it to False for each step.
     """
 
-    __slots__ = ("running",)
+    __slots__ = ("_whole_ms", "running")
 
     def __init__(self, timeout_s: float | None) -> None:
         super().__init__(timeout_s)
+        self.running = True
+        self._whole_ms = self.left_ms()
         self.running = False
+
+    def left_ms(self) -> int | None:
+        """As in ``Deadline``; the first call of a step, which starts the clock, needs no other."""
+        if self.running:
+            return super().left_ms()
+        self._run()
+        return self._whole_ms
 
     def left_s(self) -> float | None:
         """As in ``Deadline``; the first call of a step starts the clock."""
