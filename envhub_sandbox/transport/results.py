@@ -106,11 +106,6 @@ class Results:
         return columns or (parts[0] if len(parts) == 1 else infos_of.unjoined(each))
 
     @property
-    def come_unjoined(self) -> bool:
-        """Whether the workers send each sub-environment's own infos."""
-        return self.apart or self._is_sliced
-
-    @property
     def unjoined(self) -> bool:
         """Whether infos are returned unjoined, to the caller or to be joined with others."""
         return self.apart or self._is_part

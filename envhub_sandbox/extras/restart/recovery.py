@@ -223,7 +223,8 @@ class Recovery:
     def _revived(self, index: int, operation: str, answer: m.Message) -> m.Message:
         """A dead shard's reply, from its new runner's answer. Trust: input from the worker."""
         start, stop = self._bounds[index]
-        unjoined = self._lease.results.come_unjoined
+        results = self._lease.results
+        unjoined = results.apart or results.is_sliced  # as workers send them
         if operation == "step":
             return revived_step(typed_reply(answer, m.StepDone), stop - start, unjoined=unjoined)
         done = typed_reply(answer, m.ResetDone)
