@@ -45,8 +45,9 @@ from envhub_sandbox.extras.packages.interpreters import (
 )
 from envhub_sandbox.extras.packages.packages import HERE, PackageSet
 from envhub_sandbox.extras.packages.request import PackageRequest
+from envhub_sandbox.extras.packages.resolution.pylock import Lock
 from envhub_sandbox.extras.packages.resolution.resolutions import versions_for
-from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target, resolve
+from envhub_sandbox.extras.packages.resolution.resolve import Target, resolve
 from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.text import printable
 

@@ -64,6 +64,17 @@ class Source:
         return f"git+{self.url}@{self.commit}{below}"
 
 
+@dataclass(frozen=True)
+class WheelOrigin:
+    """The origin of a built wheel: its source, the digest of the lock of its build requirements,
+    and its own SHA-256.
+    """
+
+    source: Source
+    environment: str
+    wheel: str
+
+
 def of_git(requirement: Requirement, where: str) -> Source | None:
     """Returns the repository of a requirement; None unless it is ``git+https`` with a revision."""
     match = _GIT.fullmatch(requirement.url or "")

@@ -35,7 +35,7 @@ from envhub_sandbox.extras.packages.bounds import Bounds, Watch, checked, walk
 from envhub_sandbox.extras.packages.interpreters import Interpreter
 from envhub_sandbox.extras.packages.request import Tell
 from envhub_sandbox.extras.packages.resolution import index, uv
-from envhub_sandbox.extras.packages.resolution.resolve import Lock
+from envhub_sandbox.extras.packages.resolution.pylock import Lock
 from envhub_sandbox.system import folders, locks
 from envhub_sandbox.system.folders import BUILDING, CACHE_VARIABLE, cache_root, draft, remove_tree
 from envhub_sandbox.system.locks import sharers

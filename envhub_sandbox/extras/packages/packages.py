@@ -8,10 +8,9 @@ packages are used exactly, and drift is an error.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -26,11 +25,10 @@ from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import size_text
 
 if TYPE_CHECKING:
-    from envhub_sandbox.extras.packages.builds.wheels import WheelOrigin
     from envhub_sandbox.extras.packages.environments import Environment
     from envhub_sandbox.extras.packages.interpreters import Interpreter
     from envhub_sandbox.extras.packages.locks.lockfile import LockFile
-    from envhub_sandbox.extras.packages.resolution.resolve import Lock
+    from envhub_sandbox.extras.packages.resolution.pylock import Lock
     from envhub_worker.protocol.manifest.manifest import Manifest
 
 _CHECK_REFERENCE = (
@@ -105,16 +103,10 @@ class ThisMachine:
 def _warn_of_cuda(lock: Lock, interpreter: Interpreter) -> None:
     """Announce large downloads for CUDA before they begin, and the setting that avoids them."""
     from envhub_sandbox.extras.packages import environments
-    from envhub_sandbox.extras.packages.locks import pylock
 
     if environments.ready(environments.key_of(lock, interpreter)) is not None:
         return
-    size = 0
-    with contextlib.suppress(DependencyError, LockError):  # the installation will report the fault
-        packages = pylock.listed(lock.packages, interpreter.path, lock.options)
-        size = sum(
-            max((wheel.size or 0 for wheel in package.wheels), default=0) for package in packages
-        )
+    size = sum(max(wheel.size or 0 for wheel in package.wheels) for package in lock.pinned)
     much = f" ({size_text(size)} of downloads)" if size else ""
     warn_caller(
         f"PyTorch comes with CUDA{much}, and jails have no GPU here: the index has no build "
@@ -188,7 +180,8 @@ def locked_packages(snapshot: Snapshot, lock: LockFile) -> PackageSet:
     Raises ``LockDriftError`` if the files or the interpreter differ from the lock.
     """
     from envhub_sandbox.extras.packages import environments, interpreters
-    from envhub_sandbox.extras.packages.locks import lockfile, making, pylock
+    from envhub_sandbox.extras.packages.locks import lockfile, making
+    from envhub_sandbox.extras.packages.resolution import resolve
 
     state = making.with_files(lock, snapshot)
     making.refuse(making.differences(lock, state), snapshot.label)
@@ -197,8 +190,7 @@ def locked_packages(snapshot: Snapshot, lock: LockFile) -> PackageSet:
         state = replace(state, runner=lockfile.Runner.of(interpreter))
         making.refuse(making.differences(lock, state), snapshot.label)
         with log.progress_shown("packages") as tell:
-            locked = [package.origin for package in lock.packages if package.origin is not None]
-            pins = _with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)
+            pins = _with_wheels(resolve.pins(lock.packages), interpreter, tell)
             environment = environments.provide(pins, interpreter, tell)
             return PackageSet.of(environment)
     except (DependencyError, LockError) as error:
@@ -206,29 +198,28 @@ def locked_packages(snapshot: Snapshot, lock: LockFile) -> PackageSet:
         raise
 
 
-def _with_wheels(
-    lock: Lock, locked: Sequence[WheelOrigin], interpreter: Interpreter, tell: Tell
-) -> Lock:
+def _with_wheels(lock: Lock, interpreter: Interpreter, tell: Tell) -> Lock:
     """Adds wheels for packages without one to a lock: kept wheels, or new builds of locked sources.
     Raises ``DependencyError`` if a build fails or a source has changed.
     """
     from envhub_sandbox.extras.packages import environments
     from envhub_sandbox.extras.packages.builds.wheels import describe
+    from envhub_sandbox.extras.packages.resolution.pylock import Lock
     from envhub_sandbox.extras.packages.resolution.resolutions import build
-    from envhub_sandbox.extras.packages.resolution.resolve import Lock
 
+    locked = [package.origin for package in lock.pinned if package.origin is not None]
     if not locked or environments.ready(environments.key_of(lock, interpreter)) is not None:
         return lock
     wheels = build([origin.source for origin in locked], interpreter, tell)
-    text, options = lock.text, list(lock.options)
+    built, options = {}, list(lock.options)
     for origin, wheel in zip(locked, wheels, strict=True):
-        built = describe(wheel)
-        assert built is not None
-        if built.wheel != origin.wheel:
+        built[origin.source.name] = here = describe(wheel)
+        assert here is not None
+        if here.wheel != origin.wheel:
             tell(f"{origin.source.name} was built again, and not to the same bytes")
-        text = text.replace(f"sha256:{origin.wheel}", f"sha256:{built.wheel}")
         options += ["--find-links", str(wheel.parent)]
-    return Lock(text, tuple(options))
+    pinned = (replace(package, origin=built.get(package.name)) for package in lock.pinned)
+    return Lock(tuple(pinned), tuple(options))
 
 
 def check_locked_tasks(

@@ -16,7 +16,7 @@ from huggingface_hub import hf_hub_download
 from envhub_sandbox import errors, make_env
 from envhub_sandbox.extras.packages import interpreters
 from envhub_sandbox.extras.packages.locks import lockfile
-from envhub_sandbox.extras.packages.locks.pylock import PylockPackage, Wheel
+from envhub_sandbox.extras.packages.resolution.pylock import PylockPackage, Wheel
 from envhub_sandbox.extras.sources import assets
 from tests.hub.stub_hub import StubHub, StubRepository
 from tests.support.repositories import STILL

@@ -24,14 +24,15 @@ from envhub_sandbox.extras.packages.request import (
 )
 from envhub_sandbox.extras.packages.resolution import resolutions
 from envhub_sandbox.extras.packages.resolution import resolve as resolving
-from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target
+from envhub_sandbox.extras.packages.resolution.pylock import Lock
+from envhub_sandbox.extras.packages.resolution.resolve import Target
 from envhub_sandbox.extras.packages.source import RepositoryPackages
 from envhub_sandbox.extras.sources import parsing
 from envhub_sandbox.hub.snapshot import Snapshot, local, snapshot_named
 from tests.hub.stub_hub import StubHub
 from tests.support import inside
 from tests.support.packages.refusals import refused_dependency
-from tests.support.packages.wheels import Index, make_wheel
+from tests.support.packages.wheels import Index, locked, make_wheel
 
 pytestmark = pytest.mark.usefixtures("snapshot_store")
 MAKE = "\ndef make_env(n_envs=1, use_async_envs=False): ..."
@@ -311,7 +312,7 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             raise DependencyError(
                 "does not satisfy Python>=3.98 and a depends on Python>=3.98", reason="resolution"
             )
-        return Lock("a==1 \\\n    --hash=sha256:00\n")
+        return locked("a==1")
 
     monkeypatch.setattr(resolving, "resolve", resolve)
     return found

@@ -16,10 +16,10 @@ from envhub_sandbox.extras.packages.declared import Source, of_git, parse_requir
 from envhub_sandbox.extras.packages.interpreters import Interpreter
 from envhub_sandbox.extras.packages.request import PackageRequest
 from envhub_sandbox.extras.packages.resolution import resolutions, resolve
+from envhub_sandbox.extras.packages.resolution.pylock import Lock
 from envhub_sandbox.extras.packages.resolution.resolutions import resolution_for
-from envhub_sandbox.extras.packages.resolution.resolve import Lock
 from tests.support.packages.refusals import refused_dependency
-from tests.support.packages.wheels import Index, make_wheel
+from tests.support.packages.wheels import Index, locked, make_wheel
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
@@ -191,7 +191,7 @@ def test_nothing_else_is_a_repository(url: str) -> None:
 
 
 TORCH = PackageRequest("requirements.txt", (parse_requirement("vision", "line 1"),))
-CUDA = Lock("torch==2.5 \\\n    --hash=sha256:00\nnvidia-cublas==1 \\\n    --hash=sha256:00\n")
+CUDA = locked("torch==2.5", "nvidia-cublas==1")
 
 
 @pytest.fixture
@@ -241,7 +241,7 @@ def test_who_has_a_gpu_gets_cuda(gpu: bool, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_pytorchs_index_is_asked_only_if_none_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     lock = CUDA
-    without = Lock("torch==2.5+cpu \\\n    --hash=sha256:00\n")
+    without = locked("torch==2.5+cpu")
     monkeypatch.delenv("UV_TORCH_BACKEND", raising=False)
     for chosen, asked in ((True, [()]), (False, [(), ("--torch-backend", "cpu")])):
         monkeypatch.setattr(

@@ -22,7 +22,8 @@ from envhub_sandbox.extras.packages.request import PackageRequest, chosen
 from envhub_sandbox.extras.packages.resolution import index as places
 from envhub_sandbox.extras.packages.resolution import resolutions, uv
 from envhub_sandbox.extras.packages.resolution import resolve as module
-from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target
+from envhub_sandbox.extras.packages.resolution.pylock import Lock
+from envhub_sandbox.extras.packages.resolution.resolve import Target
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.sdists import backend, make_sdist
 from tests.support.packages.wheels import WORKERS, Index, make_wheel

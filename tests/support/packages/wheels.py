@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from envhub_sandbox.extras.packages.resolution.pylock import Lock, PylockPackage, Wheel
 from tests.support.ports import QuietHandler, serving
 
 WORKERS = {"cloudpickle": "3.1.0", "gymnasium": "1.2.0", "msgpack": "1.1.0", "numpy": "2.1.0"}
@@ -228,3 +229,9 @@ def real_index(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Index]:
         repacked(wheels, name)
     with only_index(folder, wheels) as found:
         yield found
+
+
+def locked(*pins: str, sha256: str = "0" * 64) -> Lock:
+    """A lock of packages that are only named."""
+    rows = (pin.split("==") for pin in pins)
+    return Lock(tuple(PylockPackage(*row, (Wheel(sha256),)) for row in rows))

@@ -26,7 +26,8 @@ from envhub_sandbox.extras.packages.builds.wheels import MAX_BYTES
 from envhub_sandbox.extras.packages.declared import Source, parse_requirement
 from envhub_sandbox.extras.packages.interpreters import Interpreter
 from envhub_sandbox.extras.packages.request import PackageRequest, Tell
-from envhub_sandbox.extras.packages.resolution.resolve import MOST_SOURCES, Lock
+from envhub_sandbox.extras.packages.resolution.pylock import Lock
+from envhub_sandbox.extras.packages.resolution.resolve import MOST_SOURCES
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.system.platform import pidfd, program
 from envhub_worker.protocol.runtime import OWN
@@ -250,7 +251,7 @@ class _Build:
         wanted = [*self._project.requires, *(parse_requirement(text, origin) for text in further)]
         if not wanted:
             (self._place / "nothing").mkdir(exist_ok=True)
-            return self._place / "nothing", Lock("").digest
+            return self._place / "nothing", Lock(()).digest
         request = PackageRequest(origin, tuple(wanted), runs_worker=False)
         lock = self._choose(request, self._interpreter, self._tell)
         return environments.provide(lock, self._interpreter, self._tell).packages, lock.digest

@@ -36,7 +36,7 @@ from envhub_sandbox.extras.packages.builds.trees import (
     check_zip,
     not_as_expected,
 )
-from envhub_sandbox.extras.packages.declared import Source
+from envhub_sandbox.extras.packages.declared import Source, WheelOrigin
 from envhub_sandbox.extras.packages.interpreters import Interpreter
 from envhub_sandbox.hub.listing import (
     SHA256,
@@ -58,17 +58,6 @@ _UNREADABLE = (
     *(OSError, EOFError, ValueError, RuntimeError, NotImplementedError, KeyError),
     *(zipfile.BadZipFile, zlib.error, csv.Error),
 )
-
-
-@dataclass(frozen=True)
-class WheelOrigin:
-    """The origin of a built wheel: its source, the digest of the lock of its build requirements,
-    and its own SHA-256.
-    """
-
-    source: Source
-    environment: str
-    wheel: str
 
 
 def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> None:

@@ -17,9 +17,9 @@ from typing import Any
 from envhub_sandbox.errors import DependencyError, LockError
 from envhub_sandbox.extras.packages.declared import parse_requirement
 from envhub_sandbox.extras.packages.interpreters import Interpreter
-from envhub_sandbox.extras.packages.locks import pylock
-from envhub_sandbox.extras.packages.locks.pylock import PylockPackage, as_toml, rows
 from envhub_sandbox.extras.packages.request import DATE
+from envhub_sandbox.extras.packages.resolution import pylock
+from envhub_sandbox.extras.packages.resolution.pylock import PylockPackage, as_toml, rows
 from envhub_sandbox.extras.sources.toml import table
 from envhub_sandbox.system.folders import write_whole_file
 

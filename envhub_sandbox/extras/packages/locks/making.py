@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -13,8 +14,8 @@ import numpy as np
 
 from envhub_sandbox.errors import LockDriftError
 from envhub_sandbox.extras.packages import interpreters
+from envhub_sandbox.extras.packages.builds.wheels import describe
 from envhub_sandbox.extras.packages.declared import WantedPackage, parse_requirement
-from envhub_sandbox.extras.packages.locks import pylock
 from envhub_sandbox.extras.packages.locks.day import settled
 from envhub_sandbox.extras.packages.locks.lockfile import (
     LOCAL,
@@ -22,9 +23,11 @@ from envhub_sandbox.extras.packages.locks.lockfile import (
     Runner,
     TaskFingerprint,
 )
-from envhub_sandbox.extras.packages.locks.pylock import PylockPackage
-from envhub_sandbox.extras.packages.request import Choice, request_of
+from envhub_sandbox.extras.packages.request import Choice, PackageRequest, request_of
+from envhub_sandbox.extras.packages.resolution import resolve
+from envhub_sandbox.extras.packages.resolution.pylock import Lock, PylockPackage
 from envhub_sandbox.extras.packages.resolution.resolutions import resolution_for
+from envhub_sandbox.extras.packages.resolution.resolve import Target
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_worker.protocol.spaces.spaces import encode_space
 from envhub_worker.protocol.text import first_of, printable
@@ -156,7 +159,7 @@ def locked(snapshot: Snapshot, choice: Choice, *, upgrade: bool = False) -> Lock
     resolution = resolution_for(request, upgrade=upgrade)
     empty = LockFile(
         *("", "", "", {}, Runner.of(resolution.interpreter)),
-        packages=pylock.described(resolution.lock, resolution.interpreter.path),
+        packages=_with_origins(resolution.lock),
         extra=tuple(map(str, choice.extra)),
         only=None if choice.only is None else tuple(map(str, choice.only)),
         override=tuple(map(str, choice.override)),
@@ -169,6 +172,18 @@ def locked(snapshot: Snapshot, choice: Choice, *, upgrade: bool = False) -> Lock
         exclude_newer=request.exclude_newer,
     )
     return with_files(empty, snapshot)
+
+
+def _with_origins(lock: Lock) -> tuple[PylockPackage, ...]:
+    """Returns the packages; those that were built here with their sources in place of wheels."""
+    folders = [Path(option) for option in lock.options if option.startswith("/")]
+    wheels = [wheel for folder in folders for wheel in folder.glob("*.whl")]
+    origins = {origin.wheel: origin for origin in map(describe, wheels) if origin is not None}
+    packages = []
+    for package in lock.pinned:
+        built = [origins[wheel.sha256] for wheel in package.wheels if wheel.sha256 in origins]
+        packages.append(replace(package, wheels=(), origin=built[0]) if built else package)
+    return tuple(packages)
 
 
 def again(lock: LockFile) -> Choice:
@@ -195,11 +210,11 @@ def relisted(lock: LockFile) -> LockFile:
     pins = [
         f"{package.name}=={package.version}" for package in lock.packages if package.origin is None
     ]
-    interpreter = interpreters.find(lock.runner.python)
-    options = pylock.pins(lock.packages).options
-    listed = pylock.listed(pins, interpreter.path, options, refresh=True)
-    packages = tuple(sorted((*built, *listed), key=attrgetter("name")))
-    return replace(lock, packages=packages)
+    request = PackageRequest("the lock", _parsed(pins), runs_worker=False)
+    target = Target(python=interpreters.find(lock.runner.python).path)
+    options = (*resolve.pins(lock.packages).options, "--no-deps")
+    listed = resolve.resolve(request, target, options=options, refresh=True).pinned
+    return replace(lock, packages=tuple(sorted((*built, *listed), key=attrgetter("name"))))
 
 
 def tasks_of(suites: Mapping[str, Mapping[Any, Any]]) -> tuple[TaskFingerprint, ...]:

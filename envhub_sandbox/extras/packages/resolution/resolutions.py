@@ -24,8 +24,9 @@ from envhub_sandbox.extras.packages import interpreters
 from envhub_sandbox.extras.packages.declared import Source, of_git, parse_requirement
 from envhub_sandbox.extras.packages.interpreters import Interpreter
 from envhub_sandbox.extras.packages.request import PackageRequest, Tell, chosen
-from envhub_sandbox.extras.packages.resolution import index, resolve
-from envhub_sandbox.extras.packages.resolution.resolve import WORKERS, Lock, Target
+from envhub_sandbox.extras.packages.resolution import index, pylock, resolve
+from envhub_sandbox.extras.packages.resolution.pylock import Lock
+from envhub_sandbox.extras.packages.resolution.resolve import WORKERS, Target
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import folders
 from envhub_sandbox.system.log import warn_caller
@@ -33,7 +34,7 @@ from envhub_sandbox.system.log import warn_caller
 if TYPE_CHECKING:
     from envhub_sandbox.extras.packages.modules import Guess
 
-_FORMAT = 2
+_FORMAT = 3
 _MOST_CURES = 6
 _CHECK_S = 60.0
 Builder = Callable[[Sequence[Source], Interpreter, Tell], Sequence[Path]]
@@ -306,7 +307,8 @@ def recall(key: str) -> Resolution | None:
     """Returns the remembered resolution, if there is one and its interpreter is unchanged."""
     try:
         facts = json.loads(folders.recall(root(), key) or "{}")
-        lock = Lock(str(facts["lock"]), tuple(map(str, facts["options"])))
+        packages = pylock.read(pylock.document(facts["lock"], key), key)
+        lock = Lock(packages, tuple(map(str, facts["options"])))
         interpreter = Interpreter(**facts["interpreter"])
         # each lock includes the worker's needs: an empty one is damaged
         is_fresh = _stamp(interpreter) == facts["stamp"] and all(
@@ -322,7 +324,7 @@ def recall(key: str) -> Resolution | None:
 def remember(key: str, found: Resolution) -> None:
     """Remember a resolution. An unwritable cache is no error."""
     facts = {
-        "lock": found.lock.text,
+        "lock": f'lock-version = "1.0"\n{pylock.written(found.lock.pinned)}',
         "options": found.lock.options,
         "interpreter": asdict(found.interpreter),
         "stamp": _stamp(found.interpreter),

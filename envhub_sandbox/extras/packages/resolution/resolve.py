@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.errors import DependencyError, LockError
 from envhub_sandbox.extras.packages import interpreters
 from envhub_sandbox.extras.packages.declared import Source, WantedPackage, parse_requirement
 from envhub_sandbox.extras.packages.request import PackageRequest, Tell
-from envhub_sandbox.extras.packages.resolution import index, uv
-from envhub_sandbox.extras.sources import toml
+from envhub_sandbox.extras.packages.resolution import index, pylock, uv
+from envhub_sandbox.extras.packages.resolution.pylock import Lock, PylockPackage
 from envhub_sandbox.settings.options import option_name
 
 WORKERS = ("cloudpickle>=3", "gymnasium>=0.26", "msgpack>=1.0.5", "numpy>=1.21")
@@ -37,7 +37,6 @@ MOST_SOURCES = 50
 """Packages that one request may build: a repository names them, and each costs a resolution."""
 _TORCH = ("torch", "torchvision", "torchaudio")
 _CPU_INDEX = ("--torch-backend", "cpu")
-_PIN = re.compile(r"([a-z0-9][a-z0-9.-]*)==([A-Za-z0-9.!+_-]+) \\")
 _IS_PYTHON = re.compile(
     r"does not satisfy Python|with a matching Python|no usable wheels|requires? Python"
 )
@@ -49,36 +48,7 @@ _BOUNDED = re.compile(
 _NO_WHEELS = re.compile(r"Wheels are required for `([A-Za-z0-9._-]+)`")
 _NO_SOURCES = re.compile(r"A source distribution is required for `([a-z0-9-]+)`")
 _NEEDS_PYTHON = re.compile(r"does not satisfy Python>=(3\.\d+)")
-_HASH = re.compile(r"    --hash=(sha(?:256|384|512):[0-9a-f]+)( \\)?")
-
-
-@dataclass(frozen=True)
-class Lock:
-    """All packages, pinned with the hashes of their wheels in the form of pip's
-    ``--require-hashes``, and options for uv if the index lacks some of the packages.
-    """
-
-    text: str
-    options: tuple[str, ...] = ()
-
-    @property
-    def has_cuda(self) -> bool:
-        """Tells whether the packages include PyTorch and packages of NVIDIA's."""
-        pins = self.packages
-        return any(pin.startswith("torch==") for pin in pins) and any(
-            pin.startswith(("nvidia-", "cuda-")) for pin in pins
-        )
-
-    @property
-    def digest(self) -> str:
-        """Returns the hexadecimal SHA-256 of the text."""
-        return hashlib.sha256(self.text.encode()).hexdigest()
-
-    @property
-    def packages(self) -> list[str]:
-        """Returns ``name==version`` of each package."""
-        lines = [line.split()[0] for line in self.text.splitlines() if line[:1].isalnum()]
-        return [line for line in lines if "==" in line]
+_ANSWER = "the answer of uv"
 
 
 @dataclass(frozen=True)
@@ -126,20 +96,15 @@ def resolve(
     for a version whose files lack a required hash (``reason`` is then ``"integrity"``).
     """
     words = [*uv.NO_BUILDS, "--generate-hashes", *options, *(["--refresh"] if refresh else [])]
-    text = _compiled(request, target, words, tell, timeout_s=timeout_s)
-    pins: list[tuple[str, str, list[str]]] = []
-    for line in text.splitlines():
-        if pin := _PIN.fullmatch(line):
-            pins.append((pin[1], pin[2], []))
-        elif (hashed := _HASH.fullmatch(line)) and pins:
-            pins[-1][2].append(hashed[1])
-        else:
-            raise DependencyError(
-                f"uv returned {line[:200]!r}, which is not a pinned package with hashes: the index "
-                "must list the hashes of its packages",
-                reason="resolution",
-            )
-    return Lock(_with_their_hashes(pins, request.wanted), tuple(options))
+    answer = _compiled(request, target, words, tell, timeout_s=timeout_s)
+    for row in answer["packages"]:
+        row.pop("marker", None)  # it holds for this target
+    try:
+        packages = pylock.read(answer, _ANSWER)
+    except LockError as error:
+        text = f"{error}; the index must list the hashes of its packages"
+        raise DependencyError(text, reason="resolution") from error
+    return Lock(_permitted(packages, request.wanted), tuple(options))
 
 
 def _compiled(
@@ -149,8 +114,8 @@ def _compiled(
     tell: Tell,
     settings: Mapping[str, str] = {},
     timeout_s: float = _RESOLVE_S,
-) -> str:
-    """Returns the output of ``uv pip compile``; raises as ``resolve``."""
+) -> dict[str, Any]:
+    """Returns the answer of ``uv pip compile``; raises as ``resolve``."""
     ours = WORKERS if request.runs_worker else ()
     where = "the worker of envhub-sandbox"
     every = [*request.wanted, *(parse_requirement(text, where) for text in ours)]
@@ -163,7 +128,7 @@ def _compiled(
     ask = partial(
         uv.run,
         [
-            *("pip", "compile", "-", "--no-header", "--no-annotate"),
+            *("pip", "compile", "-", "--format", "pylock.toml"),
             *(*target.options, *index.options(), *words),
             *_exclude_newer(request),
             *(word for pair in named.items() for word in pair),
@@ -174,7 +139,7 @@ def _compiled(
         files={**{name: files[option] for option, name in named.items()}, **settings},
     )
     try:
-        return ask(tell=tell)
+        return {"packages": []} | pylock.document(ask(tell=tell), _ANSWER)
     except DependencyError as error:
         if error.reason != "resolution":
             raise
@@ -247,12 +212,11 @@ def _sources(
     request: PackageRequest, target: Target, names: Iterable[str], words: Sequence[str]
 ) -> list[Source]:
     """Returns the sources of these packages, as uv chooses them; raises as ``resolve``."""
-    words = ["--config-file", "uv.toml", "--format", "pylock.toml", *words]
-    text = _compiled(request, target, words, lambda line: None, _may_be_built(names))
-    rows = toml.loads(text, len(text), generated=True).get("packages", [])
+    words = ["--config-file", "uv.toml", *words]
+    answer = _compiled(request, target, words, lambda line: None, _may_be_built(names))
     return [
         Source(row["name"], row["version"], sdist["url"], sdist["hashes"]["sha256"])
-        for row in rows
+        for row in answer["packages"]
         if (sdist := row.get("sdist")) and not row.get("wheels")
     ]
 
@@ -261,20 +225,20 @@ def uploaded(wanted: WantedPackage, python: str) -> str:
     """Returns the day of the newest release, by a wheel or a source; empty if the index states
     none.
     """
-    request, words = PackageRequest("", (wanted,), runs_worker=False), ("--format", "pylock.toml")
+    request = PackageRequest("", (wanted,), runs_worker=False)
     ask = partial(_compiled, request, Target(python=python), tell=lambda line: None)
     built = _may_be_built([canonicalize_name(wanted.requirement.name)])
-    texts, failed = list[str](), list[DependencyError]()
+    releases, failed = list[dict[str, Any]](), list[DependencyError]()
     for way, settings in ((uv.NO_BUILDS, {}), (("--config-file", "uv.toml"), built)):
         try:
-            texts.append(ask([*way, "--no-deps", *words], settings=settings))
+            releases += ask([*way, "--no-deps"], settings=settings)["packages"]
         except DependencyError as error:
             failed.append(error)
-    if not texts:
+    if not releases:
         raise failed[0]
-    text = max(texts, key=lambda text: Version(re.findall(r'(?m)^version = "(.+)"', text)[0]))
-    days = re.findall(r"upload-time = [^\d]{0,40}(\d{4}-\d{2}-\d{2})", text)
-    return max(days, default="")
+    newest = max(releases, key=lambda row: Version(row["version"]))
+    files = [newest.get("sdist", {}), *newest.get("wheels", ())]
+    return max((str(file.get("upload-time", ""))[:10] for file in files), default="")
 
 
 def _may_be_built(names: Iterable[str]) -> dict[str, str]:
@@ -308,27 +272,29 @@ def without_wheels(error: DependencyError) -> list[str]:
     return [] if _NEEDS_PYTHON.search(str(error)) else _NO_WHEELS.findall(str(error))
 
 
-def _with_their_hashes(
-    pins: Iterable[tuple[str, str, list[str]]], wanted: Sequence[WantedPackage]
-) -> str:
-    """Returns the lock's text; each package keeps only the hashes that its requirement permits."""
+def _permitted(
+    packages: Iterable[PylockPackage], wanted: Sequence[WantedPackage]
+) -> tuple[PylockPackage, ...]:
+    """Returns the packages, each with only the wheels whose hashes its requirement permits."""
     permitted: dict[str, tuple[set[str], str]] = {}
-    for package in wanted:
-        if package.hashes:
-            key = canonicalize_name(package.requirement.name)
-            permitted.setdefault(key, (set(), package.where))[0].update(package.hashes)
-    lines = []
-    for name, version, hashes in pins:
-        among, origin = permitted.get(canonicalize_name(name), (set(hashes), ""))
-        kept = [digest for digest in hashes if digest in among]
-        if not kept:
+    for need in wanted:
+        if need.hashes:
+            key = canonicalize_name(need.requirement.name)
+            permitted.setdefault(key, (set(), need.where))[0].update(need.hashes)
+    kept = []
+    for package in packages:
+        wheels, origin = package.wheels, ""
+        if package.name in permitted:
+            among, origin = permitted[package.name]
+            wheels = tuple(wheel for wheel in wheels if f"sha256:{wheel.sha256}" in among)
+        if not wheels:
             raise DependencyError(
-                f"the index has {name}=={version}, but no file of it with a hash that {origin} "
-                "names. It was replaced there, or the hash is another file's",
+                f"the index has {package.name}=={package.version}, but no file of it with a hash "
+                f"that {origin} names. It was replaced there, or the hash is another file's",
                 reason="integrity",
             )
-        lines.append(" \\\n".join([f"{name}=={version}", *(f"    --hash={k}" for k in kept)]))
-    return "".join(f"{line}\n" for line in lines)
+        kept.append(replace(package, wheels=wheels))
+    return tuple(kept)
 
 
 def _what_is_required(said: str, every: Sequence[WantedPackage]) -> str:
@@ -428,3 +394,9 @@ def torch_options(lock: Lock) -> tuple[str, ...]:
         pin.partition("==")[0] in _TORCH and pin.endswith("+cpu") for pin in lock.packages
     )
     return _CPU_INDEX if without and not index.is_chosen() else ()
+
+
+def pins(packages: Iterable[PylockPackage]) -> Lock:
+    """Returns the lock that installs the packages."""
+    lock = Lock(tuple(packages))
+    return replace(lock, options=torch_options(lock))

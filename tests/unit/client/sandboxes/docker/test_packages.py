@@ -17,9 +17,9 @@ from envhub_sandbox.extras.packages.declared import parse_requirement
 from envhub_sandbox.extras.packages.interpreters import InstalledPackage
 from envhub_sandbox.extras.packages.modules import Guess
 from envhub_sandbox.extras.packages.request import PackageRequest
-from envhub_sandbox.extras.packages.resolution.resolve import Lock
 from tests.attacks.output.painting import ESCAPES, paints
 from tests.support.packages.refusals import refused_dependency
+from tests.support.packages.wheels import locked
 
 OURS = interpreters.own()
 NEWER = replace(OURS, path="/opt/envhub-worker/bin/python", libc="99.0")
@@ -120,17 +120,14 @@ def test_the_images_python_is_the_one_that_there_is() -> None:
             interpreter_fitting(NEWER, request)
 
 
-LOCK = Lock(
-    "minigrid==3.0.0 \\\n    --hash=sha256:aa \\\n    --hash=sha256:bb\nnumpy==2.1.0 \\\n"
-    "    --hash=sha256:cc\n"
-)
+LOCK = locked("minigrid==3.0.0", "numpy==2.1.0")
 
 
 def test_the_tag_is_the_hash_of_all_that_an_image_is_made_of() -> None:
     tags = {
         packages.tag_for("org/repo", base, lock, system)
         for base in ("sha256:1", "sha256:2")
-        for lock in (LOCK, Lock(LOCK.text + "x==1 \\\n"))
+        for lock in (LOCK, locked("minigrid==3.0.0", "numpy==2.1.0", sha256="1" * 64))
         for system in ((), ("libgl1",))
     }
     assert len(tags) == 8

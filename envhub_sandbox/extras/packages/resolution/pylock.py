@@ -1,7 +1,8 @@
-"""Reads and writes the standard part of a lock file, https://peps.python.org/pep-0751/, as data.
+"""Packages with their files: read from uv's answers and from lock files, and written to the latter.
 
-uv writes this part for the pins; this module reads its output, checks it and prints it anew. uv
-never receives the text of a lock file, only names, versions and hashes that match our patterns.
+Both have the form of https://peps.python.org/pep-0751/, which is read as data, checked, and printed
+anew. uv never receives the text of a lock file, only names, versions and hashes that match our
+patterns.
 
 A package without a wheel on the index is locked by its source, which is fetched and hashed again.
 The hash of the built wheel tells whether the next build gives the same bytes; the compilers of two
@@ -10,22 +11,19 @@ machines give different ones.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from pathlib import Path
 from typing import Any, TypeGuard
 
 from packaging.requirements import InvalidRequirement, Requirement
 from packaging.version import InvalidVersion, Version
 
-from envhub_sandbox.errors import DependencyError, LockError
-from envhub_sandbox.extras.packages.builds.wheels import WheelOrigin, describe
-from envhub_sandbox.extras.packages.declared import Source, of_git
-from envhub_sandbox.extras.packages.resolution import index, uv
-from envhub_sandbox.extras.packages.resolution.resolve import Lock, Target, torch_options
+from envhub_sandbox.errors import LockError
+from envhub_sandbox.extras.packages.declared import Source, WheelOrigin, of_git
 from envhub_sandbox.extras.sources import toml
 from envhub_sandbox.extras.sources.toml import table
 from envhub_sandbox.hub.logins import without_login
@@ -39,7 +37,6 @@ _VERSION = re.compile(r"[A-Za-z0-9.!+_-]{1,200}")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 _URL = re.compile(r"(?:https?|file)://[^\s\"\\]{1,2000}")
-_DESCRIBE_S = 600.0
 
 
 @dataclass(frozen=True)
@@ -71,57 +68,33 @@ class PylockPackage:
         return " \\\n".join([f"{self.name}=={self.version}", *hashes]) + "\n"
 
 
-def pins(packages: Sequence[PylockPackage]) -> Lock:
-    """Returns the lock that installs the packages."""
-    lock = Lock("".join(package.pin for package in packages))
-    return replace(lock, options=torch_options(lock))
+@dataclass(frozen=True)
+class Lock:
+    """All packages, and options for uv if the index lacks some of them."""
 
+    pinned: tuple[PylockPackage, ...]
+    options: tuple[str, ...] = ()
 
-def described(lock: Lock, python: str) -> tuple[PylockPackage, ...]:
-    """Returns the pins with their files on the index, for the interpreter at this path.
+    @property
+    def text(self) -> str:
+        """Returns the pins in the form of pip's ``--require-hashes``."""
+        return "".join(package.pin for package in self.pinned)
 
-    Raises ``DependencyError`` if the pins permit no file of a package.
-    """
-    versions = [line.partition(" ")[0] for line in lock.text.splitlines()]
-    available = listed(versions, python, lock.options)
-    permitted = set(re.findall(r"--hash=sha256:([0-9a-f]{64})", lock.text))
-    built = _origins(lock)
-    kept = []
-    for package in available:
-        origin = next(
-            (built[wheel.sha256] for wheel in package.wheels if wheel.sha256 in built), None
-        )
-        if origin is not None:
-            kept.append(PylockPackage(package.name, package.version, (), origin))
-            continue
-        wheels = tuple(wheel for wheel in package.wheels if wheel.sha256 in permitted)
-        if not wheels:
-            raise DependencyError(
-                f"the index has {package.name}=={package.version}, but no file of it for {python} "
-                "with the hash that was chosen. Choose again: envhub lock --upgrade REF",
-                reason="integrity",
-            )
-        kept.append(PylockPackage(package.name, package.version, wheels))
-    return tuple(kept)
+    @property
+    def digest(self) -> str:
+        """Returns the hexadecimal SHA-256 of the text."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
 
+    @property
+    def packages(self) -> list[str]:
+        """Returns ``name==version`` of each package."""
+        return [f"{package.name}=={package.version}" for package in self.pinned]
 
-def listed(
-    versions: Sequence[str], python: str, options: Sequence[str] = (), *, refresh: bool = False
-) -> tuple[PylockPackage, ...]:
-    """Lists the index's files for each ``name==version``. Raises as ``uv.run``."""
-    text = uv.run(
-        [
-            *("pip", "compile", "-", *uv.NO_BUILDS, "--no-deps", "--format", "pylock.toml"),
-            *("--no-header", "--no-annotate", *Target(python=python).options),
-            *(*index.options(), *options),
-            *(("--refresh",) if refresh else ()),
-        ],
-        what="the files of the packages could not be listed",
-        given="".join(f"{version}\n" for version in versions if "==" in version),
-        timeout_s=_DESCRIBE_S,
-    )
-    origin = "the answer of uv"
-    return read(document(text, origin), origin)
+    @property
+    def has_cuda(self) -> bool:
+        """Tells whether the packages include PyTorch and packages of NVIDIA's."""
+        names = [package.name for package in self.pinned]
+        return "torch" in names and any(name.startswith(("nvidia-", "cuda-")) for name in names)
 
 
 def document(text: str, where: str) -> dict[str, Any]:
@@ -211,14 +184,6 @@ def _origin(given: Mapping[str, Any], name: str, version: str, where: str) -> Wh
     if not _is(url, _URL) or not _is(digest, _SHA256):
         raise LockError(f"{name} in {where} has no source with a URL and a SHA-256")
     return WheelOrigin(Source(name, version, url, digest), environment, wheel)
-
-
-def _origins(lock: Lock) -> dict[str, WheelOrigin]:
-    """Returns the origins of a lock's wheels that were built here, by the hash of the wheel."""
-    folders = [Path(option) for option in lock.options if option.startswith("/")]
-    wheels = [wheel for folder in folders for wheel in folder.glob("*.whl")]
-    origins = [built for built in map(describe, wheels) if built is not None]
-    return {origin.wheel: origin for origin in origins}
 
 
 def written(packages: Sequence[PylockPackage]) -> str:
