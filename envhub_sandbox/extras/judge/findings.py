@@ -104,6 +104,7 @@ class Report:
         unmade: Checks that no task had when a deadline ended the judgement.
         folder: The folder's path below the current folder, which in CI is the checkout with the
             annotated files; ends with a slash; empty if equal or elsewhere.
+        most: How many findings to keep; each check may always keep some.
     """
 
     reference: str
@@ -119,6 +120,7 @@ class Report:
     waiting: list[str] = field(default_factory=list)
     unmade: list[str] = field(default_factory=list)
     folder: str = ""
+    most: int = _MOST
     _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
     def judged(self, check: str, texts: Iterable[str], task: str = "") -> None:
@@ -139,7 +141,7 @@ class Report:
 
     def add(self, finding: Finding) -> Finding | None:
         """Adds a finding in printable form; returns None if the report is full."""
-        if len(self.findings) >= _MOST and self._kept[finding.id] >= _OF_EACH:
+        if len(self.findings) >= self.most and self._kept[finding.id] >= _OF_EACH:
             self.left_out += 1
             return None
         self._kept[finding.id] += 1

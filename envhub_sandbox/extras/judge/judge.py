@@ -134,10 +134,8 @@ class _Judge:
         reference = self._asked.reference
         moving = f"{reference} can mean another commit or version tomorrow"
         self._report.judged("pinned", [moving] if is_moving(reference, self._snapshot) else [])
-        findings = survey(self._snapshot, self._files).findings
-        for finding in findings:
-            self._report.add(finding)
-        wrong = {finding.id for finding in findings}
+        survey(self._snapshot, self._files, self._report)
+        wrong = {finding.id for finding in self._report.findings}
         for check in CHECKS:
             if check.startswith(("licence", "card", "source-")) and check not in wrong:
                 self._report.judged(check, [])

@@ -8,9 +8,8 @@ an author can hide a call, and only the sandbox protects. Unread files are findi
 from __future__ import annotations
 
 import itertools
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from importlib import metadata
 from operator import attrgetter
 from pathlib import Path, PurePosixPath
@@ -22,7 +21,7 @@ from packaging.utils import canonicalize_name
 
 from envhub_sandbox.errors import DependencyError, SnapshotError
 from envhub_sandbox.extras.judge import contents
-from envhub_sandbox.extras.judge.findings import Finding
+from envhub_sandbox.extras.judge.findings import Finding, Report
 from envhub_sandbox.extras.packages import interpreters
 from envhub_sandbox.extras.packages.declared import DeclaredPackages, declared
 from envhub_sandbox.extras.packages.resolution.resolve import WORKERS
@@ -32,16 +31,13 @@ from envhub_sandbox.extras.sources.parsing import MOST_BYTES, Import, ParsedFile
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.hub.local import IGNORED, REPOSITORY, LocalFolder
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_worker.protocol.text import counted, first_of, printable
+from envhub_worker.protocol.text import counted, first_of
 
-_LONGEST = 500
 _MOST_BYTES_OF_TEXT = 1 << 20
 _MOST_BYTES_IN_ALL = 32 << 20
 _MOST_OF_A_FILE = 100
 _MOST = 20_000
 """Findings to keep: the limit of files is the same."""
-_OF_EACH = 20
-"""Findings that each check may always keep."""
 _LONGEST_LINK = 1024
 _SHOWN_IGNORED = 10
 
@@ -54,54 +50,45 @@ class File:
     kind: str
 
 
-@dataclass
-class Survey:
-    """The files that were read. ``findings``: suspicious contents, file by file."""
+def survey(
+    snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None], report: Report
+) -> list[File]:
+    """Examines every file of a repository, and the result of ``parsing.read``; adds the suspicious
+    contents to a report.
+    """
 
-    files: list[File] = field(default_factory=list)
-    findings: list[Finding] = field(default_factory=list)
-    _kept: Counter[str] = field(default_factory=Counter, repr=False)
+    def add(findings: Iterable[Finding]) -> None:
+        for finding in findings:
+            report.add(finding)
 
-    def add(self, found: Iterable[Finding]) -> None:
-        """Add the findings of one check or file, up to the limits."""
-        for finding in found:
-            self._kept[finding.id] += 1
-            if len(self.findings) < _MOST or self._kept[finding.id] <= _OF_EACH:
-                self.findings.append(finding)
-
-
-def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Survey:
-    """Examines every file of a repository, and the result of ``parsing.read``."""
-    surveyed = Survey()
+    files: list[File] = []
     if snapshot.repo_type != "pypi":  # its only file is ours
-        surveyed.add(_papers(snapshot))
-    surveyed.add(_in_place(snapshot))
-    surveyed.add(_in_front(snapshot))
+        add(_papers(snapshot))
+    add(_in_place(snapshot))
+    add(_in_front(snapshot))
     left, unread = _MOST_BYTES_IN_ALL, 0
     for record in sorted(snapshot.files, key=attrgetter("path")):
         path = snapshot.root / record.path
         ending = bytes_of(path, contents.ENDING, max(record.size - contents.ENDING, 0))
         kind = contents.kind_of_contents(record.path, bytes_of(path, contents.BEGINNING), ending)
-        surveyed.files.append(File(record, kind))
-        surveyed.add(contents.of_kind(record.path, kind, is_folder=snapshot.is_local))
+        files.append(File(record, kind))
+        add(contents.of_kind(record.path, kind, is_folder=snapshot.is_local))
         for finding in contents.hidden(record.path, record.path, is_code=True):
-            surveyed.add([Finding(finding.id, f"its name {finding.message}", file=record.path)])
+            add([Finding(finding.id, f"its name {finding.message}", file=record.path)])
         if record.path in parsed:
-            surveyed.add(_in_code(record, parsed[record.path]))
+            add(_in_code(record, parsed[record.path]))
         if parsed.get(record.path) is not None:
-            surveyed.add(_in_text(record, path, is_code=True))
+            add(_in_text(record, path, is_code=True))
         elif kind in ("Python", "text") and record.size <= min(left, _MOST_BYTES_OF_TEXT):
             left -= record.size
-            surveyed.add(_in_text(record, path, is_code=kind == "Python"))
+            add(_in_text(record, path, is_code=kind == "Python"))
         else:
             unread += kind == "text"
     if unread:
         texts = counted(unread, "text is", "texts are")
         message = f"{texts} more than is read: 1 MiB of a file, and 32 MiB in all"
-        surveyed.findings.append(Finding("source-unread", message))
-    if len(surveyed.findings) >= _MOST:
-        surveyed.findings.append(Finding("source-unread", "there is more to find than is kept"))
-    return surveyed
+        add([Finding("source-unread", message)])
+    return files
 
 
 def bytes_of(path: Path, most: int, start: int = 0) -> bytes:
@@ -292,26 +279,23 @@ class Static:
 def static(snapshot: Snapshot) -> Static:
     """Reads a repository without running it."""
     parsed = parsing.read(snapshot)
-    surveyed = survey(snapshot, parsed)
-    entry = parsed.get(snapshot.path)
-    findings, says = surveyed.findings, None
+    report, says = Report(snapshot.reference, most=_MOST), None
     try:
         says = declared(snapshot.root, snapshot.path)
     except DependencyError as error:
-        findings = [Finding("requirements", str(error)), *findings]
+        report.add(Finding("requirements", str(error)))
+    files = survey(snapshot, parsed, report)
+    if report.left_out:
+        report.add(Finding("source-unread", "there is more to find than is kept"))
+    entry = parsed.get(snapshot.path)
     return Static(
         snapshot=snapshot,
-        files=surveyed.files,
+        files=files,
         entries=() if entry is None else entry.entries,
         imports=imports(snapshot, parsed),
         declared=says,
-        findings=sorted(map(_printable, findings), key=attrgetter("check.severity.rank")),
+        findings=report.findings,
     )
-
-
-def _printable(finding: Finding) -> Finding:
-    file, message = printable(finding.file, _LONGEST), printable(finding.message, _LONGEST)
-    return replace(finding, file=file, message=message)
 
 
 def document(read: Static) -> dict[str, Any]:

@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envhub_sandbox.extras.judge.checks import Severity
-from envhub_sandbox.extras.judge.static import Survey, survey
+from envhub_sandbox.extras.judge.findings import Finding
+from envhub_sandbox.extras.judge.static import static
 from envhub_sandbox.extras.sources import parser, parsing
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.hub.snapshot import local
@@ -49,19 +50,20 @@ def from_the_hub(folder: Path) -> Snapshot:
     return Snapshot("org/repo", "model", "0" * 40, "env.py", folder, tuple(records))
 
 
-def surveyed(snapshot: Snapshot) -> Survey:
-    return survey(snapshot, parsing.read(snapshot))
+def surveyed(snapshot: Snapshot) -> list[Finding]:
+    """What ``static`` finds, but for what the repository declares."""
+    return [one for one in static(snapshot).findings if one.id != "requirements"]
 
 
 def found(folder: Path, data: bytes | str, name: str = "odd.py") -> list[tuple[str, int]]:
     repository(folder, name, data)
-    return [(one.id, one.line) for one in surveyed(local(folder)).findings if one.file == name]
+    return [(one.id, one.line) for one in surveyed(local(folder)) if one.file == name]
 
 
 def of_each(folder: Path, texts: list[str]) -> dict[str, set[tuple[str, int]]]:
     for number, text in enumerate(texts):
         repository(folder, f"odd{number}.py", text)
-    told = surveyed(local(folder)).findings
+    told = surveyed(local(folder))
     return {
         text: {(one.id, one.line) for one in told if one.file == f"odd{number}.py"}
         for number, text in enumerate(texts)
@@ -213,7 +215,7 @@ def test_files_are_told_by_their_beginnings_and_ends(tmp_path: Path) -> None:
     """Whatever they are called, but what Python runs by its name; nothing opens them further."""
     for number, (name, data, *_) in enumerate(_KINDS):
         repository(tmp_path / "r", f"{number}/{name}", data)
-    told = surveyed(from_the_hub(tmp_path / "r"))
+    told = static(from_the_hub(tmp_path / "r"))
     kinds = {one.record.path: one.kind for one in told.files}
     for number, (name, _, kind, check) in enumerate(_KINDS):
         path = f"{number}/{name}"
@@ -236,7 +238,7 @@ def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
     """And keeps nothing else from being read."""
     for number, text in enumerate(_UNREADABLE):
         repository(tmp_path / "r", f"{number}.py", text.encode("latin-1"))
-    told = surveyed(local(repository(tmp_path / "r", "last.py", "eval(x)"))).findings
+    told = surveyed(local(repository(tmp_path / "r", "last.py", "eval(x)")))
     checks = {one.file: set() for one in told}
     for one in told:
         checks[one.file].add(one.id)
@@ -249,7 +251,7 @@ def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:
 def test_places_are_named_with_their_lines(tmp_path: Path) -> None:
     text = "a = 1\nb = '\u202ec\u202e'\nd = '\u200b'\ne = '" + "x y " * 700 + "'\n"
     repository(tmp_path / "r", "odd.py", text)
-    told = [one for one in surveyed(local(tmp_path / "r")).findings if one.file == "odd.py"]
+    told = [one for one in surveyed(local(tmp_path / "r")) if one.file == "odd.py"]
     assert [(one.id, one.line, one.message[:12]) for one in told] == [
         ("source-hidden", 2, "holds U+202E"),
         ("source-hidden", 3, "holds U+200B"),
@@ -280,7 +282,7 @@ def test_what_is_read_of_a_repository_is_bounded(
     folder = repository(tmp_path / "r", "odd.py", "")
     for number in range(70):
         (folder / f"part{number:02}.py").write_bytes(b"#" * 150)
-    left_over = [one.file for one in surveyed(from_the_hub(folder)).findings]
+    left_over = [one.file for one in surveyed(from_the_hub(folder))]
     assert left_over == sorted(left_over)
     assert left_over[-1] == "part69.py"
     assert 0 < len(left_over) < 10
@@ -302,7 +304,7 @@ def test_machine_code_in_place_of_a_source_fails(tmp_path: Path) -> None:
         (folder / package).mkdir(exist_ok=True)
         (folder / package / "__init__.abi3.so").write_bytes(b"\x7fELF")
     (folder / "lib.py").write_text("x = 1")
-    told = surveyed(from_the_hub(folder)).findings
+    told = surveyed(from_the_hub(folder))
     compiled = {"env.abi3.so", "lib/__init__.abi3.so", "lib/fast.cpython-311-x86_64-linux-gnu.so"}
     assert {one.file for one in told if one.id == "source-compiled"} == compiled
 
@@ -315,9 +317,9 @@ def test_no_flood_hides_what_weighs_more(tmp_path: Path, monkeypatch: pytest.Mon
         (folder / f"a{number:03}.py").write_text("eval()\n" * 101)
     for number in range(3):
         (folder / f"b{number}.txt").write_text("a b\n" * (1 << 18))
-    told = surveyed(from_the_hub(folder)).findings
+    told = surveyed(from_the_hub(folder))
     assert len(told) > 1_000
-    assert [one.message for one in told[-2:]] == [
+    assert [one.message for one in told if one.id == "source-unread" and not one.file] == [
         "2 texts are more than is read: 1 MiB of a file, and 32 MiB in all",
         "there is more to find than is kept",
     ]
@@ -329,12 +331,12 @@ def test_links_are_named(tmp_path: Path) -> None:
     """Those of a folder, and those that git made, which the Hub hands out as texts."""
     folder = repository(tmp_path / "r", "data.txt", "# something else\n")
     (folder / "alias.txt").symlink_to("data.txt")
-    told = [one for one in surveyed(local(folder)).findings if one.id == "source-link"]
+    told = [one for one in surveyed(local(folder)) if one.id == "source-link"]
     assert [(one.file, one.message) for one in told] == [("alias.txt", "a link to data.txt")]
     for name, target in (("alias.txt", "data.txt"), ("out.txt", "../../etc/x")):
         (folder / name).unlink(missing_ok=True)
         (folder / name).write_text(target)
-    told = [one for one in surveyed(from_the_hub(folder)).findings if one.id == "source-link"]
+    told = [one for one in surveyed(from_the_hub(folder)) if one.id == "source-link"]
     assert [one.file for one in told] == ["alias.txt", "out.txt"]
 
 
@@ -418,7 +420,7 @@ def test_odd_encodings_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
             del sys.modules[f"odd{number}"]
     finally:
         codecs.unregister(evil)
-    told = surveyed(local(tmp_path / "r")).findings
+    told = surveyed(local(tmp_path / "r"))
     wrong = {one.file: one for one in told if one.id == "source-encoding"}
     assert sorted(wrong) == [f"odd{number}.py" for number in range(len(_RUNS))]
     assert {one.check.severity for one in wrong.values()} == {Severity.ERROR}

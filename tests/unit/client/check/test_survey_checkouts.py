@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.extras.judge.checks import Severity
 from envhub_sandbox.extras.judge.findings import Finding
-from envhub_sandbox.extras.judge.static import survey
-from envhub_sandbox.extras.sources import checkout, parsing
+from envhub_sandbox.extras.judge.static import static
+from envhub_sandbox.extras.sources import checkout
 from envhub_sandbox.hub.snapshot import local
 from tests.hub.olah_server import GitRepository
 
@@ -29,8 +29,7 @@ def repository(tmp_path: Path, snapshot_store: Path) -> GitRepository:
 
 
 def found(folder: Path) -> list[Finding]:
-    snapshot = local(folder)
-    return survey(snapshot, parsing.read(snapshot)).findings
+    return static(local(folder)).findings
 
 
 def failing(folder: Path) -> set[str]:
@@ -228,7 +227,7 @@ def test_a_clone_is_judged_as_its_commit_or_fails(files: dict[str, tuple[str, by
         if subprocess.run(command, check=False, capture_output=True).returncode:
             return  # git makes no such clone, as where .gitmodules is a link
         snapshot = local(f"{place}/clone")
-        found = survey(snapshot, parsing.read(snapshot)).findings
+        found = static(snapshot).findings
         judged = {one.path: (snapshot.root / one.path).read_bytes() for one in snapshot.files}
     failing = {one.file for one in found if one.check.severity is Severity.ERROR}
     lines = {path: data.replace(b"\r\n", b"\n") for path, data in judged.items()}
