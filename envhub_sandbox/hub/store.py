@@ -25,7 +25,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
@@ -144,7 +144,7 @@ def endpoint_of(tree: Path) -> str:
     """The endpoint from which a stored repository was downloaded, without a login. Raises
     ``OSError``, ``ValueError`` or ``LookupError`` if it is not known.
     """
-    return str(json.loads((tree.parent / "record.json").read_bytes())["endpoint"])
+    return str(_record_beside(tree)["endpoint"])
 
 
 def programs_of(tree: Path) -> frozenset[str] | None:
@@ -152,10 +152,17 @@ def programs_of(tree: Path) -> frozenset[str] | None:
     such mode; None of a folder outside the store.
     """
     try:
-        record = json.loads((tree.parent / "record.json").read_bytes())
+        return frozenset(_record_beside(tree).get("programs", ()))
     except FileNotFoundError:
         return None
-    return frozenset(record.get("programs", ()))
+
+
+def _record_beside(tree: Path) -> dict[str, Any]:
+    # beside another folder a file of this name is a stranger's
+    if cache_root() / "snapshots" not in tree.parents:
+        raise FileNotFoundError(f"{tree} is not in the store")
+    record: dict[str, Any] = json.loads((tree.parent / "record.json").read_bytes())
+    return record
 
 
 def is_public(slot: Slot) -> bool:

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import hashlib
+import shutil
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,6 +28,7 @@ from envhub_sandbox.extras.remote.repository import (
 )
 from envhub_sandbox.extras.remote.sandbox import facts_of
 from envhub_sandbox.extras.remote.tcp import TcpServer
+from envhub_sandbox.hub import store
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.extras.access import keys
@@ -171,7 +173,8 @@ def test_a_key_that_was_mistyped_is_not_repeated(config: Path, tmp_path: Path) -
         assert wrong not in str(caught.value)
 
 
-def test_a_listing_names_each_file_once(tmp_path: Path) -> None:
+def test_a_listing_names_each_file_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The record that says which are programs is believed in the store alone."""
     large = b"x" * (remote_repository.PIECE_BYTES + 1)
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub/b").write_bytes(large)
@@ -181,8 +184,12 @@ def test_a_listing_names_each_file_once(tmp_path: Path) -> None:
     assert [one.sha256 for one in found] == [hashlib.sha256(x).digest() for x in (b"", large)]
     assert [one.executable for one in found] == [False, False]
     # a store on Windows, whose disk has no modes; the record has those of git
-    (tmp_path.parent / "record.json").write_text('{"programs": ["sub/b"]}')
-    assert [one.executable for one in remote_repository.listing(tmp_path)] == [False, True]
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path.parent / "cache"))
+    tree = store.folder_of("local") / tmp_path.name
+    shutil.copytree(tmp_path, tree)
+    for root, executable in ((tree, [False, True]), (tmp_path, [False, False])):
+        (root.parent / "record.json").write_text('{"programs": ["sub/b"]}')
+        assert [one.executable for one in remote_repository.listing(root)] == executable
     (tmp_path.parent / "record.json").unlink()
     (tmp_path / "gone").symlink_to("nowhere")
     with pytest.raises(errors.SnapshotError, match="cannot be read"):
