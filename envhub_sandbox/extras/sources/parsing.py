@@ -20,6 +20,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
+from time import monotonic
 from typing import Any, NamedTuple
 
 from envhub_sandbox.extras.sources import parser
@@ -32,7 +33,7 @@ MOST_BYTES_IN_ALL = 16 << 20
 MOST_LOST = 4
 """Children that may die; the remaining files stay unread."""
 _PATIENCE_S = 600.0
-"""Seconds to wait for a child that neither computes nor ends; normally its CPU limit ends it."""
+"""Seconds for all children. Normally its CPU limit ends one that computes for long."""
 
 
 class ImportStatement(NamedTuple):
@@ -122,18 +123,18 @@ def _open_no_link(path: str, flags: int) -> int:
 def parsed(texts: Mapping[str, bytes]) -> dict[str, ParsedFile | None]:
     """Parses each text; None for a text that cost a child too much."""
     parsed_files: dict[str, ParsedFile | None] = dict.fromkeys(texts)
-    waiting = list(texts)
+    waiting, deadline = list(texts), monotonic() + _PATIENCE_S
     for _ in range(MOST_LOST):
-        if not waiting:
+        if not waiting or (left_s := deadline - monotonic()) <= 0:
             break
-        answers = list(_answers([texts[name] for name in waiting]))
+        answers = list(_answers([texts[name] for name in waiting], left_s))
         for name, answer in zip(waiting, answers, strict=False):
             parsed_files[name] = answer
         waiting = waiting[len(answers) + 1 :]  # the next text ended the child
     return parsed_files
 
 
-def _answers(texts: list[bytes]) -> Iterator[ParsedFile | None]:
+def _answers(texts: list[bytes], left_s: float) -> Iterator[ParsedFile | None]:
     with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as taken:
         for text in texts:
             given.write(len(text).to_bytes(4, "big"))
@@ -147,7 +148,7 @@ def _answers(texts: list[bytes]) -> Iterator[ParsedFile | None]:
                 stderr=subprocess.DEVNULL,
                 cwd="/",
                 env=own_variables(),
-                timeout=_PATIENCE_S,
+                timeout=left_s,
                 check=False,
             )
         taken.seek(0)

@@ -134,14 +134,19 @@ def test_a_file_that_costs_too_much_is_not_read(
     assert parsing.parsed(texts) == {**read, "second.py": None}
 
 
-def test_lost_children_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("each_takes_s", "most"), [(0.0, parsing.MOST_LOST), (400.0, 2)])
+def test_lost_children_are_counted(
+    each_takes_s: float, most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And have ten minutes together."""
     ended = weaker(tmp_path, ("  tree = ", "  signal.raise_signal(9)\n        tree = "))
     monkeypatch.setattr(parser, "__file__", ended)
     began: list[object] = []
     run = subprocess.run
+    monkeypatch.setattr(parsing, "monotonic", lambda: each_takes_s * len(began))
     monkeypatch.setattr(subprocess, "run", lambda *a, **k: (began.append(a), run(*a, **k))[1])
     assert set(parsing.parsed({f"{number}.py": b"" for number in range(1000)}).values()) == {None}
-    assert len(began) == parsing.MOST_LOST
+    assert len(began) == most
 
 
 def test_only_a_regular_file_is_read(tmp_path: Path) -> None:
