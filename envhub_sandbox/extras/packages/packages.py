@@ -150,7 +150,9 @@ def packages_for(
 
 def _is_unknown(repo_id: str, error: DependencyError) -> bool:
     """Tells whether the index lacks the package, or the version, that a reference names."""
-    name = re.escape(re.sub(r"[-_.]+", "-", re.split(r"[\[#@]", repo_id)[0]).lower())
+    from envhub_sandbox.extras.packages.modules import canonical
+
+    name = re.escape(canonical(re.split(r"[\[#@]", repo_id)[0]))
     pattern = rf"no version of {name}\b|\b{name} was not found"
     return error.reason == "resolution" and re.search(pattern, str(error)) is not None
 
