@@ -46,7 +46,7 @@ class SendRecv(VectorEnv[Any, Any, Any]):
         self._requests = session.requests
         self._manifest = session.manifest
         self._readers: dict[int, Callable[[Any], Any]] = {}
-        self._flight: Any = None  # an ``InFlight``, once it is needed
+        vars(self).pop("_flight", None)  # an ``InFlight``, once it is needed, of this session
         self.num_envs = session.manifest.num_envs
 
     @short_traceback
@@ -157,12 +157,13 @@ class SendRecv(VectorEnv[Any, Any, Any]):
             self._requests.before_request()
 
     def _in_flight(self) -> Any:
-        if self._flight is None:
+        flight = vars(self).get("_flight")
+        if flight is None:
             in_flight = extras.required(_IN_FLIGHT, "InFlight", "send and recv")
-            with self._requests.use.flight:
-                parts = getattr(self._session, "parts", [self._session])
-                self._flight = self._flight or in_flight(self._requests, parts)
-        return self._flight
+            parts = getattr(self._session, "parts", [self._session])
+            # without a lock, for which ``recv`` would wait longer than its timeout
+            flight = vars(self).setdefault("_flight", in_flight(self._requests, parts))
+        return flight
 
 
 def _seeds_of(named: list[int], seed: Any, manifest: EnvManifest) -> Any:

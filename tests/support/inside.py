@@ -426,3 +426,8 @@ def door_is_shut(doorman: ConnectionLimiter) -> bool:
 def making_an_environment(step: str) -> Spot:
     """A step of it: ``install``, ``size``, ``compile``, ``close`` or ``publish``."""
     return environments, f"_{step}"
+
+
+def flight_of(env: Any) -> Any:
+    """The lock that a reset holds, and a recv."""
+    return env._requests.use.flight

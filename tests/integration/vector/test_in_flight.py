@@ -195,6 +195,15 @@ def test_a_timeout_ends_the_wait_for_another_threads_recv(gates: Gates) -> None:
         assert ids(own.result(60)) == [0, 1]
 
 
+@pytest.mark.parametrize("lane", ["auto"])
+def test_a_timeout_ends_the_wait_of_the_first_recv_for_another_threads_reset(gates: Gates) -> None:
+    env = gates.env(1)
+    with ThreadPoolExecutor(1) as threads, inside.flight_of(env):
+        late = threads.submit(env.recv, timeout=0.01)
+        with pytest.raises(WorkerTimeoutError, match=r"ready after 0\.01 s"):
+            late.result(60)
+
+
 @lanes
 def test_ctrl_c_ends_a_wait_and_loses_nothing(gates: Gates) -> None:
     """A wait takes nothing away: what was sent is received as ever."""
