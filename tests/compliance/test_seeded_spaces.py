@@ -1,5 +1,7 @@
 """Seeded spaces draw the same here and there; what nobody seeded starts anywhere, in each run."""
 
+import warnings
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +9,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from envhub_sandbox import make_env
+from envhub_sandbox import SandboxEnv, make_env
+from envhub_sandbox.errors import RemoteEnvWarning
 from tests.support.compare import assert_same
 
 REPOSITORY = """
@@ -31,7 +34,8 @@ MADE = {
 }
 
 class Seeded(gym.Env):
-    def __init__(self, kind, seed):
+    def __init__(self, kind, seed, draws):
+        self.draws = draws
         self.action_space = MADE[kind](seed)
         self.observation_space = MADE[kind](seed and seed + 1)
 
@@ -40,14 +44,16 @@ class Seeded(gym.Env):
         return self.observation_space.sample(), {}
 
     def step(self, action):
+        if self.draws:
+            self.action_space.sample()
         return self.observation_space.sample(), 0.0, False, False, {}
 
 class Own(gym.vector.SyncVectorEnv):
     pass
 
-def make_env(n_envs=1, use_async_envs=False, kind="discrete", seed=None, own=False):
+def make_env(n_envs=1, use_async_envs=False, kind="discrete", seed=None, own=False, draws=False):
     made = Own if own else gym.vector.SyncVectorEnv
-    return made([lambda: Seeded(kind, seed)] * n_envs)
+    return made([lambda: Seeded(kind, seed, draws)] * n_envs)
 """
 LOCAL: dict[str, Any] = {}
 exec(REPOSITORY, LOCAL)
@@ -106,3 +112,19 @@ def test_boxes_that_are_alike_do_not_share_a_generator(folder: Path) -> None:
     assert first.np_random is not second.np_random
     assert not np.array_equal(first.sample(), second.sample())
     env.close()
+
+
+@pytest.mark.parametrize("draws", [False, True])
+def test_a_single_environment_that_draws_from_its_action_space_says_so(
+    folder: Path, draws: bool
+) -> None:
+    """There it is one object with the caller's, and here the caller's is a copy."""
+    with (
+        closing(SandboxEnv(folder, env_kwargs={"seed": 3, "draws": draws})) as env,
+        warnings.catch_warnings(record=True) as told,
+    ):
+        warnings.simplefilter("always")
+        for _ in range(3):
+            env.reset()
+            env.step(env.action_space.sample())
+    assert [type(each.message) for each in told] == [RemoteEnvWarning] * draws

@@ -8,7 +8,6 @@ stream.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import select
 import socket
@@ -18,7 +17,7 @@ from array import array
 from collections.abc import Callable, Collection, Iterator
 from functools import partial
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
 
 import cloudpickle  # type: ignore[import-untyped]
 import gymnasium as gym
@@ -48,6 +47,10 @@ from envhub_worker.runner.tasks import ResultError, Task, tasks_of
 
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
 _RECHECK_MS = 2
+_DRAWS = (
+    "it draws from its own action_space, which seeds and draws of the caller's copy do not change: "
+    "set a seeded space in it, envs[0].unwrapped.action_space = space"
+)
 _MOST_WRAPPERS = 100
 _PLAY_S, _PLAY_MEMORY = 20.0, 0.5
 """Seconds and share of the jail's memory that playing the sub-environments of all tasks may take,
@@ -124,7 +127,7 @@ class Runner:
         play_bytes: int = 1 << 30,
     ) -> None:
         self._numbers = SpaceNumbers()
-        self._first_spaces: dict[int, tuple[list[Any], list[Any]]] = {}  # and their generators
+        self._first_spaces: dict[int, _FirstSpaces] = {}
         self._pack = partial(m.pack, describer=partial(numbered, self._numbers), limits=limits)
         self._pack_infos = partial(m.pack, describer=described, limits=limits, reduces=True)
         self._snapshot = snapshot
@@ -261,12 +264,14 @@ class Runner:
         if before is None:
             return
         # kept, so that no other object gets an id of theirs
-        spaces, generators = self._first_spaces[number] = _first_spaces(env)
-        seeded = list(map(id, generators)) != list(map(id, before[1]))
+        now = self._first_spaces[number] = _first_spaces(env)
+        seeded = list(map(id, now.generators)) != list(map(id, before.generators))
+        if getattr(env, "apart", False) and any(bits.state != old for bits, old in before.acting):
+            warnings.warn(_DRAWS, stacklevel=2)
         replaced = True
         with contextlib.suppress(Exception):  # a custom space may compare itself in any way
-            replaced = spaces != before[0]
-        if replaced or (seeded and any(map(seeded_states, spaces))):
+            replaced = now.spaces != before.spaces
+        if replaced or (seeded and any(map(seeded_states, now.spaces))):
             self.watches.changed[number, m.SPACES] = None
 
     def step(self, request: m.Step) -> m.Message:
@@ -449,11 +454,24 @@ def _declared_spaces(env: Any) -> Iterator[list[Any]]:
     yield [space if isinstance(space, gym.Space) else None for space in declared]
 
 
-def _first_spaces(env: Any) -> tuple[list[Any], list[Any]]:
-    """The first sub-environment's spaces, or the single ones, and the generators of their parts."""
+class _FirstSpaces(NamedTuple):
+    """The first sub-environment's spaces, or the single ones, and the generators of their parts.
+    ``acting``: the bit generators of the action space that Gymnasium made, each with its state.
+    """
+
+    spaces: list[Any]
+    generators: list[Any]
+    acting: list[tuple[Any, Any]]
+
+
+def _first_spaces(env: Any) -> _FirstSpaces:
     spaces = next(_declared_spaces(env))
-    nodes = itertools.chain.from_iterable(map(seeded_nodes, spaces))
-    return spaces, [getattr(node, "_np_random", None) for node in nodes]
+    seen, acting = (
+        [getattr(node, "_np_random", None) for node in seeded_nodes(space)] for space in spaces
+    )
+    bits = [getattr(generator, "bit_generator", None) for generator in acting]
+    states = [(each, each.state) for each in bits if isinstance(each, np.random.PCG64)]
+    return _FirstSpaces(spaces, seen + acting, states)
 
 
 def _call_own(env: Any, method: str, *args: Any, **kwargs: Any) -> Any:
