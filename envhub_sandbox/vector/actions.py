@@ -8,7 +8,7 @@ Followed: ``gymnasium.vector.utils.iterate``.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import singledispatch
+from functools import lru_cache, singledispatch
 from typing import Any
 
 import gymnasium as gym
@@ -18,6 +18,7 @@ from gymnasium.error import CustomSpaceError, Error
 
 from envhub_sandbox.errors import ActionError, ActionTypeError
 from envhub_sandbox.session.requests import Bounds, MessageFor
+from envhub_sandbox.system.log import warn_caller
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, BOX_DTYPES, OpaqueSpace
@@ -128,6 +129,9 @@ def batch_of_one(space: gym.Space[Any], action: Any, name: str = "action") -> An
     """
     if isinstance(space, spaces.Dict) and isinstance(action, Mapping):
         keys = [key for key in space.spaces if key in action]
+        theirs = [key for key in action if key in space.spaces]
+        if theirs != keys:
+            _tell_order(tuple(theirs), tuple(keys))
         return {key: batch_of_one(space[key], action[key], f"{name}[{key!r}]") for key in keys}
     if isinstance(space, spaces.Tuple) and isinstance(action, (tuple, list)):
         parts = enumerate(zip(space.spaces, action, strict=False))
@@ -146,6 +150,14 @@ def batch_of_one(space: gym.Space[Any], action: Any, name: str = "action") -> An
     if type(action) is list:
         return [action]
     return array[None] if array.ndim or isinstance(action, np.generic) else [array]
+
+
+@lru_cache(maxsize=16)  # once
+def _tell_order(theirs: tuple[Any, ...], keys: tuple[Any, ...]) -> None:
+    warn_caller(
+        f"the action has its keys in the order {[*theirs]}; the environment gets them in the order "
+        f"of its space, {[*keys]}, as from a vector environment"
+    )
 
 
 def action_reader(manifest: EnvManifest, count: int) -> Callable[[Any], Any]:

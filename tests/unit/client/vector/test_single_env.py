@@ -1,5 +1,6 @@
 """A vector environment of one as a ``gymnasium.Env``: the same episodes as without it."""
 
+import warnings
 from typing import Any
 
 import gymnasium as gym
@@ -66,6 +67,20 @@ def test_a_list_of_numbers_arrives_as_one() -> None:
     env.reset()
     actions = [0.5, 1.0], np.array([0.5, 1.0])
     assert [env.step(action)[4]["kind"] for action in actions] == ["list", "ndarray"]
+
+
+def test_keys_of_an_action_in_another_order_are_told() -> None:
+    """The environment gets them in its own, since it may go by their order."""
+    space = spaces.Dict(left=spaces.Discrete(2), right=spaces.Discrete(2))
+    env = SingleEnv(SyncVectorEnv([lambda: _Echo(space)]))
+    env.reset()
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        env.step({"left": 0, "right": 1})
+        assert not told
+        seen = [list(env.step({"right": 1, "left": 0})[0]) for _ in range(2)]
+    assert seen == [["left", "right"]] * 2
+    assert ["['right', 'left']" in str(each.message) for each in told] == [True]
 
 
 class _Boasting(_Story):
