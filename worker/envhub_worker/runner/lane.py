@@ -110,11 +110,12 @@ class Lane:
         """
         # In this order: a request that comes while we serve rings anew, so its ring must not be
         # read here.
-        rung = True
-        with contextlib.suppress(BlockingIOError):
+        try:
             rung = bool(os.read(self.bell, 8))
+        except BlockingIOError:
+            rung = True
         turns = _MOST_AWAKE if alone else 0
-        while self.serve() and turns and self._wait_awake():
+        while self.serve() and turns and (self._spin_ns or self.was_awake) and self._wait_awake():
             turns -= 1
         self._told[slabs.PARKED] = 1  # after the last turn, too: the client must ring
         return rung
@@ -160,8 +161,10 @@ class Lane:
         self._served = sequence
         words[slabs.SEQUENCE] = sequence
         if self._asked[slabs.PARKED]:
-            with contextlib.suppress(BlockingIOError):  # it is full: it has been rung already
+            try:  # noqa: SIM105 - as the loop of ``runner.main`` says
                 os.write(self._client_bell, _RING)
+            except BlockingIOError:
+                pass  # it is full: it has been rung already
         return True
 
     def _run(self) -> tuple[int, int]:

@@ -68,24 +68,28 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     poller.register(stream, select.POLLIN)
     timeout: int | None = None
     bells: dict[int, Lane] = {}
+    # Many runners take turns on a core and find its caches cold: what each wake-up runs is short.
     while True:
-        ready = [fd for fd, _ in poller.poll(timeout)]
+        ready = dict(poller.poll(timeout))
         if stream.fileno() in ready:
             if not _serve(stream, reader, runner):
                 return 0
-        elif ready:
-            for lane in [bells[bell] for bell in ready]:
-                # Only a single lane may poll for its next request: it would block other lanes.
-                if not lane.wake(alone=len(bells) == 1):
-                    runner.forget_lane(lane)
         else:
-            for lane in bells.values():
-                lane.look_again()
-        if list(bells.values()) != list(runner.lanes.values()):
+            for bell in ready:
+                # Only a single lane may poll for its next request: it would block other lanes.
+                if not bells[bell].wake(alone=len(bells) == 1):
+                    runner.forget_lane(bells[bell])
+            if not ready:
+                for lane in bells.values():
+                    lane.look_again()
+        if [*bells.values()] != [*runner.lanes.values()]:
             bells = _hear(poller, bells, runner.lanes.values())
         # A request may come while a lane stops to wait awake: its client may still read that it
         # does, and not ring. So the first sleep is short, and its end looks at every lane.
-        timeout = _RECHECK_MS if any(lane.was_awake for lane in bells.values()) else None
+        timeout = None
+        for lane in bells.values():
+            if lane.was_awake:
+                timeout = _RECHECK_MS
 
 
 def _hear(poller: select.poll, bells: Collection[int], lanes: Collection[Lane]) -> dict[int, Lane]:

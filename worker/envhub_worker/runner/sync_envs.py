@@ -233,7 +233,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self._done_before = self._done
         infos: Pairs = []
         self.reward = ()
-        copied = self._copier()
+        copied = self._copier() if self._siblings else None
         for index in chosen:
             seed = None if seeds is None else seeds[index]
             result: Sequence[Any] = ()
@@ -281,7 +281,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         """Step every sub-environment, or reset it if its episode is over; returns the infos.
         Each sub-environment gets its row of the batch of actions unchanged.
         """
-        batch, same_step, count = self.batch, self._same_step, self.num_envs
+        batch, count = self.batch, self.num_envs
         store, rows, rewards = batch.store, batch.rows, batch.rewards
         dtype, shape = (None, None) if rows[0] is None else (rows[0].dtype, rows[0].shape)
         array = np.ndarray
@@ -290,7 +290,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             terminations[index] = truncations[index] = False
         flagged = self._flagged = []
         done = [False] * count
-        copied = self._copier()
+        copied = self._copier() if self._siblings else None
         infos: Pairs = []
         index, answered, over, again = 0, -1, False, -1
         each = self._each(actions)
@@ -315,7 +315,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                         flagged.append(index)
                         terminations[index] = terminated
                         truncations[index] = truncated
-                        if same_step:
+                        if self._same_step:
                             infos.append((index, self._final(observation, info)))
                             again, answered = index, -1
                             observation, info = env.reset()
@@ -438,10 +438,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         if self._sync:
             self._done = self._done_before
 
-    def _copier(self) -> Callable[[Any], Any] | None:
-        """Returns a function that copies an info if a sibling may fill the same object next."""
-        if not self._siblings:
-            return None
+    def _copier(self) -> Callable[[Any], Any]:
+        """Returns a function that copies an info, since a sibling may fill the same object next."""
         return kept if self.apart else taken
 
     def _final(self, observation: Any, info: Any) -> dict[str, Any]:
