@@ -17,6 +17,8 @@ class Pair:
 
     reference: VectorEnv
     sandboxed: VectorEnv
+    is_async: bool = False
+    """Whether the sandboxed one stands for an ``AsyncVectorEnv``, with its order of infos."""
 
     @property
     def num_envs(self) -> int:
@@ -36,6 +38,8 @@ class Pair:
 
     def step(self, actions: Any, what: str = "step") -> Any:
         expected = self.reference.step(actions)
+        if self.is_async:
+            expected = *expected[:-1], _in_order_of_async(expected[-1])
         actual = self.sandboxed.step(actions)
         names = ("observations", "rewards", "terminations", "truncations", "infos")
         for name, one, other in zip(names, expected, actual, strict=True):
@@ -57,6 +61,16 @@ class Pair:
     @property
     def autoreset_mode(self) -> AutoresetMode:
         return self.reference.metadata["autoreset_mode"]
+
+
+_ENDS_OF_ASYNC = ("final_info", "_final_info", "final_obs", "_final_obs")
+
+
+def _in_order_of_async(infos: dict[Any, Any]) -> dict[Any, Any]:
+    """``SyncVectorEnv`` has the final observation first, ``AsyncVectorEnv`` the final info."""
+    ends = iter(_ENDS_OF_ASYNC)
+    keys = [next(ends) if key in _ENDS_OF_ASYNC else key for key in infos]
+    return {key: infos[key] for key in keys}
 
 
 def _copied(kwargs: dict[str, Any]) -> dict[str, Any]:

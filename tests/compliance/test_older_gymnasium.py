@@ -64,7 +64,7 @@ def pair(case: OlderCase, lane: str, runtimes: Any) -> Iterator[Pair]:
     """The reference in the client's Gymnasium, and the older one in a jail."""
     expected = reference("counter", case.n_envs, autoreset_mode=case.mode)
     with opened("counter", case, runtimes(case.requirements), policy={"lane": lane}) as env:
-        yield Pair(expected, env)
+        yield Pair(expected, env, case.use_async_envs)
     expected.close()
 
 

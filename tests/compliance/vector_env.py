@@ -69,7 +69,7 @@ def paired(name: str, case: Case, **options: Any) -> Iterator[Pair]:
         **options,
     )
     with suites:
-        yield Pair(expected, suites.env)
+        yield Pair(expected, suites.env, case.use_async_envs)
     expected.close()
 
 
