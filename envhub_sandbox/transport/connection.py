@@ -9,6 +9,7 @@ import secrets
 import select
 import signal
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -20,6 +21,7 @@ from envhub_sandbox.errors import (
     VersionMismatchError,
     WorkerDiedError,
     WorkerError,
+    WorkerStartupError,
     WorkerTimeoutError,
 )
 from envhub_sandbox.settings.options import option_name
@@ -45,6 +47,8 @@ Source = Any
 _Received = tuple[m.Message, list[Buffer]]
 _MOST_SOCKETS = 8192
 """A connection over a network has three sockets; ZeroMQ's default allows some 300 connections."""
+_THREADS = 2
+"""Of a context: one for input and output, and one that closes sockets."""
 _contexts: dict[int, zmq.Context[zmq.Socket[bytes]]] = {}
 
 
@@ -57,10 +61,32 @@ def _context() -> zmq.Context[zmq.Socket[bytes]]:
     """This process's ZeroMQ context; a fork makes its own, as it cannot use its parent's."""
     pid = os.getpid()
     if pid not in _contexts:
+        _check_threads()
         _contexts.clear()
         _contexts[pid] = context = zmq.Context()
         context.set(zmq.MAX_SOCKETS, _MOST_SOCKETS)
     return _contexts[pid]
+
+
+def _check_threads() -> None:
+    """Raise ``WorkerStartupError`` if ZeroMQ's threads cannot be started: it would abort this
+    process.
+    """
+    checked = threading.Event()
+    threads = [threading.Thread(target=checked.wait, daemon=True) for _ in range(_THREADS)]
+    try:
+        for thread in threads:
+            thread.start()
+    except RuntimeError as error:
+        raise WorkerStartupError(
+            f"this process cannot start the {_THREADS} threads of ZeroMQ: raise the limit on "
+            "processes and threads (ulimit -u; of a service TasksMax=; of a container its pids)"
+        ) from error
+    finally:
+        checked.set()
+        for thread in threads:
+            if thread.ident is not None:
+                thread.join()
 
 
 _LOOK_MS = 500

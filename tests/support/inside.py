@@ -32,7 +32,7 @@ from envhub_sandbox.session.launcher import Launcher, LoadedJail
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.repository import Recipe, Repository
 from envhub_sandbox.system import folders
-from envhub_sandbox.transport import output
+from envhub_sandbox.transport import connection, output
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
@@ -307,6 +307,8 @@ CLOSE_PATIENCE: Spot = (env_session, "INTERRUPT_S")
 """For how long ``close`` waits for another thread."""
 WAITS_FOR_A_SERVER: tuple[Spot, Spot] = ((launcher_module, "_CLOSE_S"), (remote, "_CLOSE_S"))
 """For how long a close waits for a server's word, also where it has gone."""
+CONTEXTS: Spot = (connection, "_contexts")
+"""ZeroMQ's contexts, by process."""
 WAIT_FOR_OUTPUT: Spot = (output, "_ASK_S")
 """How long a server may take to say what a jail has printed; who follows it then gives up."""
 STATUS_WAIT_MS: Spot = (status_command, "_WAIT_MS")

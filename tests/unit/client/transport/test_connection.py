@@ -3,18 +3,25 @@
 import os
 import select
 import subprocess
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 
 import pytest
 
-from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.errors import (
+    RemoteProtocolError,
+    WorkerDiedError,
+    WorkerStartupError,
+    WorkerTimeoutError,
+)
 from envhub_sandbox.transport.connection import WorkerConnection, describe_exit
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import WireLimits
 from tests.attacks.client.lying_server import Asked, Frames, LyingServer, lying
+from tests.support import inside
 from tests.support.processes import eventually
 
 
@@ -190,3 +197,19 @@ def test_the_log_names_each_message(caplog: pytest.LogCaptureFixture) -> None:
     assert [line.strip() for line in caplog.messages] == [
         *("> 1 Hello", "< 1 Welcome", "> 2 CheckJail step", "< 2 Done")
     ]
+
+
+def test_a_process_without_room_for_threads_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ZeroMQ would abort it. The first thread still starts, and ends."""
+    before, start = threading.active_count(), threading.Thread.start
+
+    def refuse(thread: threading.Thread) -> None:
+        if threading.active_count() > before:
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(*inside.CONTEXTS, {})
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    with pytest.raises(WorkerStartupError, match="ulimit -u"):
+        WorkerConnection("ipc:///nowhere", -1)
+    assert threading.active_count() == before
