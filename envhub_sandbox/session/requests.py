@@ -150,25 +150,23 @@ class RequestOrder(ABC):
         """Send a request, and return the values of all shards."""
         return self._ask(operation, message_for, m.Value, self._timeouts.call_s)
 
-    def ask_own(self, operation: str, kind: Callable[..., m.Message], *fields: object) -> m.Message:
-        """Ask the repository's own vector environment, which has one shard; returns its reply."""
-        kinds = (m.Value, m.Method)
-        message_for = for_every_shard(kind, *fields)
-        [reply] = self._ask(operation, message_for, kinds, self._timeouts.call_s)
-        return reply
-
     def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
-        """Ask one sub-environment; returns its reply, while other shards reply without a value."""
-        operation = f"envs[{index}].{name[:_SHOWN]}"  # unlike "reset" and "step" of all
+        """Ask one sub-environment; returns its reply, while other shards reply without a value.
+        ``index``: ``ITSELF`` asks the repository's own vector environment, which has one shard.
+        """
+        itself = index == m.ITSELF
+        who = "env" if itself else f"envs[{index}]"
+        operation = f"{who}.{name[:_SHOWN]}"  # unlike "reset" and "step" of all
         timeouts = {"reset": self._timeouts.reset_s, "step": self._timeouts.step_s}
 
         def message_for(number: int, bounds: Bounds) -> m.Message:
             start, stop = bounds
-            return message(number, index - start if start <= index < stop else None)
+            row = index - start if start <= index < stop else None
+            return message(number, m.ITSELF if itself else row)
 
         timeout_s = timeouts.get(name, self._timeouts.call_s)
         replies = self._ask(operation, message_for, (m.Value, m.Method), timeout_s)
-        holds = (start <= index < stop for start, stop in self.results.bounds)
+        holds = (itself or start <= index < stop for start, stop in self.results.bounds)
         return next(reply for reply, holds_it in zip(replies, holds, strict=True) if holds_it)
 
     def _ask(

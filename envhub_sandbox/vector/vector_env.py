@@ -24,7 +24,6 @@ from envhub_sandbox.session.requests import SENT, MessageFor, for_every_shard
 from envhub_sandbox.system.log import warn_caller
 from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Own, StepResult
 from envhub_sandbox.transport.values import not_here, seeds
 from envhub_sandbox.vector.actions import action_reader, check_mask, reset_message, seeds_for_all
@@ -457,7 +456,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     def np_random_seed(self) -> Any:
         """The seeds of the generators."""
         name = "np_random_seed"
-        replies = self._requests.ask(name, for_every_shard(m.GetOwn, name))
+        replies = self._requests.ask(name, for_every_shard(m.GetOne, m.ITSELF, 0, name))
         if type(replies[0].value) is not tuple:
             return seeds(replies[0].value)
         return seeds(self._requests.one_each(name, replies))
@@ -505,16 +504,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         ours = not is_servable(name) or hasattr(type(self), name)
         if manifest is None or ours or name not in manifest.attributes:
             raise absent(self, name, "get_attr")
-        reply = self._requests.ask_own("get attribute", m.GetOwn, name)
-        if isinstance(reply, m.Value):
-            return self._spaces.of(reply.value)
-
-        @short_traceback
-        def method(*args: Any, **kwargs: Any) -> Any:
-            result = self._requests.ask_own(name, m.CallOwn, name, args, kwargs)
-            return self._spaces.of(typed_reply(result, m.Value).value)
-
-        return method
+        return SubEnvironment(self, m.ITSELF)._get(name)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Also for copy and deepcopy: a copy has processes of its own, since either may be closed.

@@ -27,7 +27,7 @@ _ENTRY_BYTES = 150
 _REQUEST_BYTES = 500
 """What Python's objects take beside the bytes of a step, and of another request."""
 _MOST_LASTING = 256
-_LASTING = (m.Call, m.SetAttr, m.CallOwn, m.CallOne)
+_LASTING = (m.Call, m.SetAttr, m.CallOne)
 _PASSING = frozenset({"reset", "step", "render"})
 """What is over with the next seed, also where one sub-environment does it alone."""
 _FIXED = frozenset({bool, int, float, complex, str, bytes, type(None)})

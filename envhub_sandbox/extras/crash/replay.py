@@ -106,10 +106,6 @@ def _repeat(env: Any, message: m.Message) -> None:
         env.set_attr(message.name, list(message.values))
     elif isinstance(message, m.Render):
         env.render()
-    elif isinstance(message, (m.GetOwn, m.CallOwn)):
-        call = (message.args, message.kwargs) if isinstance(message, m.CallOwn) else ()
-        operation = f"env.{message.name[:_SHOWN]}"
-        env._requests.ask_own(operation, type(message), message.name, *call)
     elif isinstance(message, (m.GetOne, m.CallOne)):
         _ask_one(env, message)
     elif isinstance(message, m.GetRandom):
@@ -119,7 +115,7 @@ def _repeat(env: Any, message: m.Message) -> None:
 
 
 def _ask_one(env: Any, message: m.GetOne | m.CallOne) -> None:
-    """Ask about one sub-environment; other shards are sent no arguments."""
+    """Ask one sub-environment, or the vector environment; other shards get no arguments."""
 
     def message_for(number: int, index: int | None) -> m.Message:
         changes: dict[str, Any] = {"env": number, "index": index}
@@ -127,7 +123,7 @@ def _ask_one(env: Any, message: m.GetOne | m.CallOne) -> None:
             changes |= {"args": (), "kwargs": {}}
         return m.replace(message, **changes)
 
-    if message.index is not None and 0 <= message.index < env.num_envs:
+    if message.index is not None and m.ITSELF <= message.index < env.num_envs:
         env._requests.ask_one(message.name, message.index, message_for)
 
 

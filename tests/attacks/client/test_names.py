@@ -60,8 +60,8 @@ def greedy(liar: LyingServer, folder: str, answer: Lie | None = None, **fields: 
     value["envs"][0].update({"attributes": listed, "shardable": False, **fields})
     liar.lies[m.Load] = relayed(m.LoadDone(value))
     liar.lies[m.Build] = relayed(m.BuildDone(value["envs"][0]))
-    liar.lies[m.GetOwn] = answer or relayed(m.Method())
-    liar.lies[m.CallOwn] = relayed(m.Value(SCRIPT))
+    liar.lies[m.GetOne] = answer or relayed(m.Method())
+    liar.lies[m.CallOne] = relayed(m.Value(SCRIPT))
     return opened(liar, folder)
 
 
@@ -83,18 +83,22 @@ class Naive:
     def __getattr__(self, name: str) -> Any:
         if name not in self.__dict__.get("_listed", ()):
             raise AttributeError(name)
-        reply = self._ask(m.GetOwn, name)
+        reply = self._ask(m.GetOne, name)
         if isinstance(reply, m.Value):
             return reply.value
 
         def method(*args: Any, **kwargs: Any) -> Any:
-            result = self._ask(m.CallOwn, name, args, kwargs)
+            result = self._ask(m.CallOne, name, args, kwargs)
             return result.value
 
         return method
 
     def _ask(self, kind: type[Any], *fields: Any) -> m.Message:
-        return inside.session(self._env).requests.ask_own("ask", kind, *fields)
+        def message(number: int, row: int | None) -> m.Message:
+            asked: m.Message = kind(number, row, 0, *fields)
+            return asked
+
+        return inside.session(self._env).requests.ask_one("ask", m.ITSELF, message)
 
 
 class Forwarding(VectorWrapper):
@@ -112,7 +116,7 @@ WRAPS: list[Callable[[Any], Any]] = [
 
 
 def asked_for(liar: LyingServer) -> set[str]:
-    kinds = (m.GetOwn, m.CallOwn, m.Call, m.GetOne, m.CallOne)
+    kinds = (m.Call, m.GetOne, m.CallOne)
     return {request.name for request in liar.asked if isinstance(request, kinds)}
 
 
@@ -272,9 +276,9 @@ def test_what_libraries_do_with_any_object_reaches_no_worker(
 
 def test_what_libraries_look_for_is_served_to_who_names_it(liar: LyingServer, folder: str) -> None:
     """``size`` is an attribute of many environments: asked for by name, it is what it is."""
-    liar.lies |= {m.GetOne: relayed(m.Value(8)), m.Call: relayed(m.Value((8,)))}
-    liar.lies[m.CallOne] = relayed(m.Value(True))
     with greedy(liar, folder, attributes=("size", "to"), **OF_ONE) as suites:
+        liar.lies |= {m.GetOne: relayed(m.Value(8)), m.Call: relayed(m.Value((8,)))}
+        liar.lies[m.CallOne] = relayed(m.Value(True))
         env = suites.env
         single = SingleEnv(env)
         for thing, ask in ((env, "get_attr"), (single, "get_wrapper_attr"), (env.envs[0], "get_w")):

@@ -185,10 +185,10 @@ def test_the_control_crashes_on_an_index_and_draws_memory() -> None:
 
 @pytest.mark.parametrize("lie", [np.zeros(3), "1", 1.5, {"a": 1}, [1], (None, b"1")], ids=repr)
 def test_seeds_are_numbers(liar: LyingServer, folder: str, lie: Any) -> None:
-    liar.lies[m.GetOwn] = relayed(m.Value(lie))
+    liar.lies[m.GetOne] = relayed(m.Value(lie))
     with opened(liar, folder) as suites:
         assert isinstance(refuses(lambda: suites.env.np_random_seed), RemoteProtocolError)
-        liar.lies[m.GetOwn] = relayed(m.Value((3, None)))
+        liar.lies[m.GetOne] = relayed(m.Value((3, None)))
         assert suites.env.np_random_seed == (3, None)
 
 

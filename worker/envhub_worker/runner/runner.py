@@ -370,28 +370,20 @@ class Runner:
         """``VectorEnv.render``."""
         return m.Value(self._envs[request.env].render())
 
-    def get_own(self, request: m.GetOwn) -> m.Message:
-        """Returns an attribute of the vector environment, or of one that it wraps."""
-        value = _own(self._envs[request.env], request.name)
-        return m.Method() if callable(value) else m.Value(value)
-
-    def call_own(self, request: m.CallOwn) -> m.Message:
-        """Calls a method of the vector environment, or of one that it wraps."""
-        method = _own(self._envs[request.env], request.name)
-        return m.Value(method(*request.args, **request.kwargs))
-
     def get_one(self, request: m.GetOne) -> m.Message:
-        """Returns an attribute of one sub-environment."""
+        """Returns an attribute of one sub-environment, or of the vector environment itself."""
         value = None if request.index is None else self._found(request)
         return m.Method() if callable(value) else m.Value(value)
 
     def call_one(self, request: m.CallOne) -> m.Message:
-        """Calls a method of one sub-environment."""
+        """Calls a method of one sub-environment, or of the vector environment itself."""
         if request.index is None:
             return m.Value(None)
         return m.Value(self._found(request)(*request.args, **request.kwargs))
 
     def _found(self, request: m.GetOne | m.CallOne) -> Any:
+        if request.index == m.ITSELF:
+            return _own(self._envs[request.env], request.name)
         one, depth = self._one(request), request.depth
         env, index = self._envs[request.env], request.index
         if isinstance(env, SubEnvs) and depth in (0, -1) and index is not None:
@@ -547,8 +539,6 @@ _HANDLERS: dict[type[m.Message], Callable[[Runner, Any], m.Message]] = {
     m.Watch: Runner.watch,
     m.SetAttr: Runner.set_attr,
     m.Render: Runner.render,
-    m.GetOwn: Runner.get_own,
-    m.CallOwn: Runner.call_own,
     m.GetOne: Runner.get_one,
     m.CallOne: Runner.call_one,
     m.GetRandom: Runner.get_random,

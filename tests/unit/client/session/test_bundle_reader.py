@@ -276,8 +276,8 @@ def test_a_bundle_cannot_call_the_proxy_itself(tmp_path: Path) -> None:
     a name what is asked: a call of ``reset`` is no reset of all of them."""
     folder = bundle(tmp_path)
     calls: list[m.Message] = [
-        *(m.CallOwn(0, "close", (), {}), m.GetOwn(0, "__dict__")),
-        *(m.CallOne(0, index, 0, "close", (), {}) for index in (-1, 2, None)),
+        m.GetOne(0, m.ITSELF, 0, "__dict__"),
+        *(m.CallOne(0, index, 0, "close", (), {}) for index in (m.ITSELF, -2, 2, None)),
         m.CallOne(0, 1, 0, "__setattr__", ("asked", []), {}),
         m.Close(0),
     ]
@@ -288,13 +288,10 @@ def test_a_bundle_cannot_call_the_proxy_itself(tmp_path: Path) -> None:
     assert replay(lambda: env, load_bundle(folder)).verdict is Verdict.SURVIVED
     assert env.asked is asked
     assert asked == []
-    own, one = env.requests.ask_own.call_args_list, env.requests.ask_one.call_args_list
-    assert [call.args for call in own] == [
-        ("env.close", m.CallOwn, "close", (), {}),
-        ("env.__dict__", m.GetOwn, "__dict__"),
-    ]
-    [[name, index, message_for]] = [call.args for call in one]
-    assert (name, index) == ("__setattr__", 1)
+    each = [call.args for call in env.requests.ask_one.call_args_list]
+    names = [("__dict__", m.ITSELF), ("close", m.ITSELF), ("__setattr__", 1)]
+    assert [(name, index) for name, index, _ in each] == names
+    *_, message_for = each[-1]
     assert message_for(7, 1) == m.CallOne(7, 1, 0, "__setattr__", ("asked", []), {})
     assert message_for(7, None) == m.CallOne(7, None, 0, "__setattr__", (), {})
 

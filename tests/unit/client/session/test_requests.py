@@ -63,11 +63,14 @@ def test_what_is_sent_instead_is_not_what_is_kept(session: EnvSession, lane: Fak
 
 
 def test_a_wrong_message_gives_the_worker_up(session: EnvSession, lane: FakeLane) -> None:
+    def ask() -> m.Message:
+        return session.requests.ask_one("name", m.ITSELF, lambda *row: m.GetOne(*row, 0, "name"))
+
     for lane.answer in (m.Value(1), m.Method()):
-        assert session.requests.ask_own("name", m.GetOwn, "name") == lane.answer
+        assert ask() == lane.answer
     lane.answer = m.ResetDone(0, {})
     with pytest.raises(errors.RemoteProtocolError, match="ResetDone instead of Value or Method"):
-        session.requests.ask_own("name", m.GetOwn, "name")
+        ask()
     assert session.lifecycle.state is State.DEAD
     with pytest.raises(errors.WorkerDiedError, match="cannot render"):
         session.requests.ask("render", render)

@@ -73,7 +73,7 @@ def test_every_field_of_the_callers_own_arrives_as_it_is() -> None:
         m.LoadTask(1, False, {"a": value}, {"b": value}, "s", 0),
         m.Reset(1, [1], handed.OwnDict(a=value), None),
         m.Call(1, "told", (value,), {"b": value}),
-        m.CallOwn(1, "told", (value,), {"b": value}),
+        m.CallOne(1, m.ITSELF, 0, "told", (value,), {"b": value}),
         m.SetAttr(1, "note", (value, value)),
     ):
         frames = m.pack(message, pickler=framed)

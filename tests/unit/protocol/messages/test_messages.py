@@ -70,7 +70,7 @@ SAMPLES: list[m.Message] = [
         {},
     ),
     m.Call(1, "task", (1, "x"), {"flag": True}), m.SetAttr(1, "gravity", (9.81, None)),
-    m.Render(1), m.GetOwn(1, "hub_config"), m.Method(), m.CallOwn(1, "describe", (), {}),
+    m.Render(1), m.Method(),
     m.GetRandom(1), m.SetRandom(1, (None, {"bit_generator": "PCG64"}), True),
     m.GetOne(1, 0, None, "task"), m.CallOne(1, None, 0, "add", (1, "x"), {"flag": True}),
     m.Close(1), m.Value((None, "a", 1.5)), m.Attach(1, 2, 8, 5), m.FetchInfos(1),

@@ -117,28 +117,18 @@ class Render(Message, kind=74):
     env: int
 
 
-class GetOwn(Message, kind=75):
-    """An attribute of the vector environment itself. Reply: ``Value``, or ``Method``."""
-
-    env: int
-    name: str
-
-
 class Method(Message, kind=76):
-    """The attribute is callable; ``CallOwn`` calls it."""
+    """The attribute is callable; ``CallOne`` calls it."""
 
 
-class CallOwn(Message, kind=77, asks="method", handed=("args", "kwargs")):
-    """Call a method of the vector environment itself. Reply: ``Value``."""
-
-    env: int
-    name: str
-    args: tuple[object, ...]
-    kwargs: dict[str, object]
+ITSELF = -1
+"""In place of a sub-environment's index: the vector environment itself."""
 
 
 class GetOne(Message, kind=78):
-    """An attribute of one sub-environment. Reply: ``Value``, or ``Method`` if it can be called."""
+    """An attribute of one sub-environment, or of the vector environment itself. Reply: ``Value``,
+    or ``Method`` if it can be called.
+    """
 
     env: int
     index: int | None
@@ -146,8 +136,8 @@ class GetOne(Message, kind=78):
     name: str
 
 
-class CallOne(Message, kind=79, asks="envs", handed=("args", "kwargs")):
-    """Call a method of one sub-environment, which ``GetOne`` describes. Reply: ``Value``."""
+class CallOne(Message, kind=79, asks="method", handed=("args", "kwargs")):
+    """Call a method that ``GetOne`` describes. Reply: ``Value``."""
 
     env: int
     index: int | None
