@@ -2,21 +2,18 @@
 
 from pathlib import Path
 
-from tests.support.repositories import write_repository
+from tests.support.repositories import STILL, write_repository
 
-PLAIN = """
-import gymnasium as gym, numpy as np
-
-class Plain(gym.Env):
+PLAIN = f"""{STILL}
+class Plain(Still):
     observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
     action_space = gym.spaces.Discrete(4)
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros_like(self.observation_space.sample()), {}
+    def reset(self, **options):
+        return np.zeros_like(self.observation_space.sample()), super().reset(**options)[1]
 
     def step(self, action):
-        return np.zeros_like(self.observation_space.sample()), 0.0, False, False, {}
+        return np.zeros_like(self.observation_space.sample()), 0.0, False, False, {{}}
 
 VECTOR = gym.vector.SyncVectorEnv
 

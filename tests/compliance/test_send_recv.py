@@ -204,8 +204,8 @@ def test_an_error_does_not_overtake_the_result_before_it(tmp_path: Path, lane: s
 
 def test_who_has_ended_is_refused_in_its_turn(tmp_path: Path, lane: str) -> None:
     """Where nothing resets by itself, those before it have been stepped, as in Gymnasium."""
-    folder, here = write_repository(tmp_path, _ENDING), dict[str, Any]()
-    exec(_ENDING, here)
+    folder, here = write_repository(tmp_path, STILL + _ENDING), dict[str, Any]()
+    exec(STILL + _ENDING, here)
     expected = here["make_env"](3)
     with make_env(folder, 3, policy={"lane": lane}) as suites:
         for env in (expected, suites.env):
@@ -220,13 +220,10 @@ def test_who_has_ended_is_refused_in_its_turn(tmp_path: Path, lane: str) -> None
 
 
 _ENDING = """
-import gymnasium as gym
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
-
-class Ending(gym.Env):
+class Ending(Still):
     observation_space = action_space = gym.spaces.Discrete(9)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, **options):
         self.now = 0
         return 0, {}
 
@@ -234,6 +231,6 @@ class Ending(gym.Env):
         self.now += 1
         return self.now, 1.0, action == 1, False, {}
 
-def make_env(n_envs=1, use_async_envs=False):
-    return SyncVectorEnv([Ending] * n_envs, autoreset_mode=AutoresetMode.DISABLED)
+def vector(kind, n_envs):
+    return gym.vector.SyncVectorEnv([kind] * n_envs, autoreset_mode="Disabled")
 """
