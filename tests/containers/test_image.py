@@ -4,7 +4,6 @@ import contextlib
 import json
 import re
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.extras.docker.engines import Engine
 from envhub_sandbox.extras.docker.sandbox import DockerSandbox
 from tests.containers.kit import IMAGE
+from tests.support.command_line import python
 from tests.support.processes import eventually
 from tests.support.samples import SAMPLES
 from tests.support.started import started
@@ -99,13 +99,8 @@ def derived(engine: Engine) -> Iterator[dict[str, Any]]:
 
 
 def built(engine: Engine, repository: Path, *options: str) -> dict[str, Any]:
-    words = ("image", "build", str(repository), "--base", IMAGE, "--engine", engine.kind)
-    done = subprocess.run(
-        [sys.executable, "-I", "-m", "envhub_sandbox", *words, "--build-network", "host", "--json"],
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
+    words = ("image", "build", repository, "--base", IMAGE, "--engine", engine.kind)
+    done = python("-I", "-m", "envhub_sandbox", *words, "--build-network", "host", "--json")
     return dict(json.loads(done.stdout))
 
 

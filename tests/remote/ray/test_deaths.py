@@ -16,7 +16,7 @@ from envhub_sandbox import RaySandbox, make_env
 from envhub_sandbox.errors import WorkerDiedError
 from tests.remote.listening import counting
 from tests.remote.ray.clusters import cluster_of, node_of, only_server, servers
-from tests.support.command_line import below, gone
+from tests.support.command_line import below, gone, python
 from tests.support.processes import eventually
 from tests.support.started import started
 
@@ -139,15 +139,7 @@ def test_a_lost_head_leaves_nothing(repository: Path, monkeypatch: pytest.Monkey
 
 def test_a_local_ray_is_started_and_said(repository: Path, tmp_path: Path) -> None:
     """Where nobody has called ``ray.init``; it ends with the process."""
-    done = subprocess.run(
-        [sys.executable, "-c", LOCAL, str(repository)],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-        env={**os.environ, "RAY_TMPDIR": "/tmp/ray-none", "RAY_ADDRESS": ""},
-    )
-    assert done.returncode == 0, done.stderr
+    done = python("-c", LOCAL, repository, RAY_TMPDIR="/tmp/ray-none", RAY_ADDRESS="")
     assert (done.stdout.split(), done.stderr.count("a local Ray with")) == (["1"], 1)
     assert eventually(lambda: not servers())
 

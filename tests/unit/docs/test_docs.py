@@ -4,8 +4,6 @@ import dataclasses
 import importlib
 import re
 import string
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from envhub_worker.protocol.lifecycle import TABLE, Event, State
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.manifest import MAX_ENVS
 from envhub_worker.protocol.manifest.names import MAX_NAME
+from tests.support.command_line import python
 from tests.support.documents import checks, settings
 from tests.unit.docs.test_imports import folder
 
@@ -109,15 +108,7 @@ def fenced(text: str, language: str) -> list[str]:
 @pytest.mark.parametrize("document", ["README.md", "docs/integrations.md"])
 def test_the_python_of_a_document_runs(document: str) -> None:
     blocks = fenced((CHECKOUT / document).read_text(), "python")
-    done = subprocess.run(
-        [sys.executable, "-c", "\n".join(blocks)],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    python("-c", "\n".join(blocks), cwd=CHECKOUT)
 
 
 def test_troubleshooting_quotes_errors_that_exist() -> None:

@@ -3,7 +3,6 @@
 import ast
 import importlib.util
 import shutil
-import subprocess
 import sys
 from collections.abc import Iterator
 from functools import cache
@@ -13,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import envhub_sandbox
+from tests.support.command_line import python
 from tests.support.samples import sample
 
 WORKERS_OWN = {"cloudpickle", "envhub_worker", "gymnasium", "msgpack", "numpy", "zmq"}
@@ -340,14 +340,7 @@ def computes_imports(tree: ast.Module) -> bool:
 
 def loaded_by(source: str) -> set[str]:
     """The modules in a fresh interpreter that has run ``source``, and what ``source`` prints."""
-    done = subprocess.run(
-        [sys.executable, "-c", f"{source}\nimport sys; print(*sys.modules)"],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
-    names = done.stdout.split()
+    names = python("-c", f"{source}\nimport sys; print(*sys.modules)").stdout.split()
     return {*names, *(name.split(".")[0] for name in names)}
 
 

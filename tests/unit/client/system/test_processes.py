@@ -16,7 +16,7 @@ import envhub_sandbox
 import envhub_worker
 from envhub_sandbox.system.platform import OwnerProcess, fork_error_text, pidfd
 from envhub_sandbox.system.threads import Calls
-from tests.support.command_line import runs
+from tests.support.command_line import python, runs
 from tests.support.processes import eventually
 
 _PARENT = """
@@ -170,12 +170,6 @@ def test_a_program_of_ours_is_this_code_and_need_not_be_installed(tmp_path: Path
     )
     start = "import subprocess\nfrom envhub_sandbox.system.platform import program\n"
     start += "subprocess.run([*program('told'), 'word'], check=True)"
-    done = subprocess.run(
-        [sys.executable, "-c", start],
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        cwd="/",  # which goes before the variable, and may be a checkout
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-    )
+    # the folder goes before the variable, and may be a checkout
+    done = python("-c", start, cwd=Path("/"), PYTHONPATH=str(tmp_path))
     assert done.stdout.split() == [f"{tmp_path}/envhub_sandbox/__init__.py", "__main__", "word"]
