@@ -9,6 +9,7 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from envhub_worker.protocol.messages.prefix import SHARED_STATE
 from envhub_worker.runner.state.shared_state import SharedState
@@ -21,9 +22,13 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     module.__file__ = str(tmp_path / "scene.py")
     module.Scene = type("Scene", (), {"__module__": module.__name__, "best": 0})
     module.log = []
+    module.space = spaces.Dict(a=spaces.Discrete(9, seed=1))
+    module.generator, module.python = np.random.default_rng(1), random.Random(1)
+    module.numpy = np.random.RandomState(1)
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setenv("SCENE", "1")
     monkeypatch.chdir(os.getcwd())
+    random.random()  # where nobody has drawn since a seed, another seed moves neither word
     return module
 
 
@@ -35,6 +40,10 @@ CHANGES: list[tuple[str, Callable[[ModuleType], object]]] = [
     ("module", lambda scene: setattr(scene, "episodes", 1)),
     ("module", lambda scene: setattr(scene.Scene, "best", 1)),
     ("module", lambda scene: scene.log.append(1)),
+    ("module", lambda scene: scene.space.sample()),
+    ("module", lambda scene: scene.generator.random()),
+    ("module", lambda scene: scene.python.random()),
+    ("module", lambda scene: scene.numpy.rand()),
     ("environment", lambda scene: os.environ.update(SCENE="2")),
     ("directory", lambda scene: os.chdir("/")),
 ]

@@ -22,7 +22,10 @@ from itertools import islice
 from types import ModuleType
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
+
+from envhub_worker.protocol.spaces.spaces import seeded_nodes
 
 _WORDS = 624
 """Of a Mersenne Twister's state."""
@@ -126,17 +129,32 @@ class SharedState:
 
 
 def _plain(attributes: dict[str, Any]) -> dict[str, object]:
-    """Returns a comparable form of attributes: immutable values, and the lengths of containers."""
-    return {
-        name: _READABLE[type(value)](value)
-        for name, value in attributes.items()
-        if type(value) in _READABLE and not name.startswith("__")
-    }
+    """Returns a comparable form of attributes: immutable values, the lengths of containers, and the
+    states of generators, also of spaces.
+    """
+    comparable: dict[str, object] = {}
+    for name, value in attributes.items():
+        kind = type(value)
+        read = _of_space if issubclass(kind, gym.Space) else _READABLE.get(kind)
+        if read is not None and not name.startswith("__"):
+            comparable[name] = read(value)
+    return comparable
+
+
+def _of_generator(generator: Any) -> str:
+    return str(generator and generator.bit_generator.state)
+
+
+def _of_space(space: Any) -> list[str]:
+    return [_of_generator(getattr(node, "_np_random", None)) for node in seeded_nodes(space)]
 
 
 _READABLE: dict[type, Callable[[Any], object]] = {
     **{kind: (lambda value: (type(value), value)) for kind in _PLAIN},
     **dict.fromkeys(_CONTAINERS, len),
+    np.random.Generator: _of_generator,
+    np.random.RandomState: lambda value: str(value.get_state()),
+    random.Random: lambda value: value.getstate(),
 }
 
 
