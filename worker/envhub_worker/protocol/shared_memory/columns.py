@@ -12,7 +12,7 @@ among the scalars, and arrays behind the others (``ragged``).
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import islice
@@ -37,9 +37,11 @@ _PLAIN = frozenset({float, int, bool, str})
 _AS_TUPLES = (tuple.__iter__, tuple.__len__)
 New = tuple[list[Any], list[Any], list[ragged.Items]]
 """Scalars and arrays of new results, in the order of the columns, and arrays of varying sizes."""
-_Take = Callable[[Any, New], None]
-"""Adds the scalars and arrays of a part; raises ``IrregularError``: it has another form."""
-_Make = Callable[[Iterator[Any], Iterator[Any]], Any]
+_Take = Callable[[Any, New], None] | None
+"""Adds the scalars and arrays of a part; raises ``IrregularError``: it has another form. None for
+an array or a tensor, which ``write`` looks at."""
+_Make = Callable[[Iterator[Any], Iterator[Any]], Any] | None
+"""Makes a part of the next scalars and arrays; None for the next array."""
 
 
 class StepColumns:
@@ -67,6 +69,7 @@ class StepColumns:
         self._scalars: list[type] = []  # classes, in the order of the columns
         # Of each array: shape, dtype, offset in a slot, and its tensor's dtype by name, or "".
         self._arrays: list[tuple[tuple[int, ...], np.dtype[Any], int, str]] = []
+        self._forms: list[tuple[Any, Any, tuple[int, ...]]] = []  # class, its dtype, shape
         self.nbytes, self._room, self._parts = 0, room, 0
         self._copies: dict[int, list[ragged.Copy]] = {}  # by the slot's start; for reading
         self._views: dict[int, list[Any]] = {}  # likewise, for writing
@@ -75,9 +78,10 @@ class StepColumns:
         # Where ``read`` finds arrays of varying sizes; None afterwards, as it refers to the slot.
         self._area: Any = None
         try:
-            self._fields = [self._observed(space, values[0]), *map(self._part, values[1:])]
+            fields = [self._observed(space, values[0]), *map(self._part, values[1:])]
         except RecursionError as error:
             raise IrregularError from error
+        self._takes, self._makes = [take for take, _ in fields], [make for _, make in fields]
         self.read_bytes = self.nbytes
         self.digest = 1 + crc32(repr((self._scalars, self._arrays)).encode())
         named = enumerate(name for _, _, _, name in self._arrays)
@@ -156,12 +160,11 @@ class StepColumns:
         if type(array) is not np.ndarray or array.dtype not in arrays.NUMBERS or name == "bfloat16":
             raise IrregularError
         self._arrays.append((array.shape, array.dtype, self.nbytes, name))
+        self._forms.append((type(value), value.dtype, array.shape))
         self.nbytes += -(-array.nbytes // LINE) * LINE
         if self.nbytes > self._room:
             raise IrregularError
-        if name:
-            return partial(_take_tensor, type(value), value.dtype, array.shape), _next_array
-        return partial(_take_array, array.dtype, array.shape), _next_array
+        return None, None
 
     # --- writing and reading -------------------------------------------------------------------
 
@@ -171,8 +174,15 @@ class StepColumns:
         """
         # All values are looked at before the first is written: a slot never holds half a step.
         new: New = [], [], []
-        for (take, _), value in zip(self._fields, values, strict=True):
-            take(value, new)
+        if len(values) != len(self._takes):
+            raise IrregularError
+        _take_all(self._takes, values, new)
+        for (kind, dtype, shape), array in zip(self._forms, new[1], strict=True):
+            if type(array) is not kind or array.dtype != dtype or array.shape != shape:
+                raise IrregularError
+        for index, _ in self._tensors:
+            if self._arrays[index][0]:  # those without dimensions are copied together
+                new[1][index] = _bits(new[1][index])
         for group in self._groups:
             bits = _bits_of([new[1][index] for index in group])
             for index, array in zip(group, bits, strict=True):
@@ -216,7 +226,7 @@ class StepColumns:
         scalars: Iterator[Any] = iter(())
         taken = iter(found)
         if not self._scalars and not packed:
-            return [make(scalars, taken) for _, make in self._fields]
+            return _made(self._makes, scalars, taken)
         with UNTRUSTED:
             # A list that claims more elements, each list in it again, would take memory for them.
             read = msgpack.unpackb(packed, max_array_len=len(self._scalars), max_map_len=0)
@@ -224,14 +234,28 @@ class StepColumns:
             if type(read) is not list or list(map(type, read)) != self._scalars:
                 raise RemoteProtocolError("the worker wrote other scalars than it had announced")
             scalars = iter(read)
-            values = [make(scalars, taken) for _, make in self._fields]
+            values = _made(self._makes, scalars, taken)
         if self._varies:
             self.read_bytes, self._area = self._area.used, None
         return values
 
 
+def _take_all(takes: Sequence[_Take], values: Iterable[Any], new: New) -> None:
+    for take, value in zip(takes, values, strict=True):
+        if take is None:
+            new[1].append(value)
+        else:
+            take(value, new)
+
+
+def _made(makes: Sequence[_Make], scalars: Iterator[Any], arrays: Iterator[Any]) -> list[Any]:
+    return [next(arrays) if make is None else make(scalars, arrays) for make in makes]
+
+
 def _members(kind: Any, parts: Sequence[tuple[_Take, _Make]], keys: Any) -> tuple[_Take, _Make]:
     takes, makes = [take for take, _ in parts], [make for _, make in parts]
+    if not parts and kind in (dict, list, tuple):  # as most infos
+        return partial(_take_same, kind()), lambda scalars, arrays: kind()
     simple = bool(parts) and {*makes} == {_next_scalar}
     kinds = [take.args[0] for take in takes if isinstance(take, partial)] if simple else []
 
@@ -244,14 +268,10 @@ def _members(kind: Any, parts: Sequence[tuple[_Take, _Make]], keys: Any) -> tupl
                 raise IrregularError
             new[0].extend(items)
             return
-        for part, item in zip(takes, value.values() if kind is dict else value, strict=True):
-            part(item, new)
+        _take_all(takes, value.values() if kind is dict else value, new)
 
     def make(scalars: Iterator[Any], arrays: Iterator[Any]) -> Any:
-        if simple:
-            members = [*islice(scalars, len(makes))]
-        else:
-            members = [part(scalars, arrays) for part in makes]
+        members = [*islice(scalars, len(makes))] if simple else _made(makes, scalars, arrays)
         if kind is dict:
             return dict(zip(keys, members, strict=True))
         return members if kind is list else tuple(members)
@@ -273,10 +293,6 @@ def _next_scalar(scalars: Iterator[Any], _: Iterator[Any]) -> Any:
     return next(scalars)
 
 
-def _next_array(_: Iterator[Any], arrays: Iterator[Any]) -> Any:
-    return next(arrays)
-
-
 def _take_same(known: Any, value: Any, new: New) -> None:
     if type(value) is not type(known) or value != known:
         raise IrregularError
@@ -292,18 +308,6 @@ def _take_item(kind: Any, value: Any, new: New) -> None:
     if type(value) is not kind:
         raise IrregularError
     new[0].append(value.item())
-
-
-def _take_array(dtype: np.dtype[Any], shape: tuple[int, ...], value: Any, new: New) -> None:
-    if type(value) is not np.ndarray or value.shape != shape or value.dtype != dtype:
-        raise IrregularError
-    new[1].append(value)
-
-
-def _take_tensor(kind: Any, dtype: Any, shape: tuple[int, ...], value: Any, new: New) -> None:
-    if type(value) is not kind or value.dtype is not dtype or value.shape != shape:
-        raise IrregularError
-    new[1].append(_bits(value) if shape else value)  # those without are copied together
 
 
 def _bits_of(tensors: list[Any]) -> list[Any]:
