@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from array import array as integers
-from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import accumulate, chain, islice, pairwise
@@ -262,9 +261,10 @@ def _arrays(row: tuple[int, ...], *, optional: bool = False) -> tuple[Write, Rea
         if fewest < least:
             raise RemoteProtocolError("the worker wrote a negative size")
         rows = lengths if fewest >= 0 else [max(length, 0) for length in lengths]
-        bounds = [*accumulate(rows, initial=0)]
-        joined = received.array(code, (bounds[-1], *row), 0)
-        parts = [joined[start:stop] for start, stop in pairwise(bounds)] if count != 1 else [joined]
+        parts = [received.array(code, (sum(rows), *row), 0)]
+        if count != 1:
+            bounds = accumulate(rows, initial=0)
+            parts = [parts[0][start:stop] for start, stop in pairwise(bounds)]
         if fewest < 0:
             return [None if n < 0 else part for n, part in zip(lengths, parts, strict=True)]
         return parts
@@ -356,7 +356,7 @@ def _choices(parts: list[tuple[Write, Read]]) -> tuple[Write, Read]:
         _check(_classes(members) <= {tuple})
         numbers, chosen = zip(*members, strict=True) if members else ((), ())
         _write_integers(numbers, written)
-        _check(all(0 <= number < len(parts) for number in numbers))
+        _check(not numbers or 0 <= min(numbers) <= max(numbers) < len(parts))
         members_by_part: list[list[Any]] = [[] for _ in parts]
         for number, member in zip(numbers, chosen, strict=True):
             members_by_part[number].append(member)
@@ -365,9 +365,11 @@ def _choices(parts: list[tuple[Write, Read]]) -> tuple[Write, Read]:
 
     def read(count: int, received: Received) -> list[Any]:
         numbers = _read_integers(count, received)
-        if any(not 0 <= number < len(parts) for number in numbers):
+        if numbers and not 0 <= min(numbers) <= max(numbers) < len(parts):
             raise RemoteProtocolError("the worker wrote a choice that the space does not have")
-        counts = Counter(numbers)  # once: a hostile space may have very many parts
+        counts = [0] * len(parts)
+        for number in numbers:  # once: a hostile space may have very many parts
+            counts[number] += 1
         chosen = [iter(part(counts[index], received)) for index, (_, part) in enumerate(parts)]
         return [(number, next(chosen[number])) for number in numbers]
 
