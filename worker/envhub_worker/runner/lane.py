@@ -44,36 +44,39 @@ class Lane:
     Args:
         attach: The request that brought the slabs: rows, number of slots.
         space: The space of one sub-environment's observations, if steps are messages.
+        step: Steps the environment with a batch of actions.
+        complete: Makes the fields of ``StepDone`` of what ``step`` returned.
+        pack: Encodes a message with infos.
         fds: Request slab, reply slab, observation slab, our doorbell, the client's doorbell. The
             lane owns them.
         read: Decodes the frames of a request.
-        answer: Encodes the answer to a request. Returns no frames if its second argument, a
-            function that may write the reply into columns, has done so.
+        answer: Encodes the answer to any other request.
         raised: Makes the message for an exception.
         warned: The repository's warnings that no reply has carried yet. While there are any, the
             client fetches answers through the server, which puts them in front.
         watches: The attributes that the client watches; their changes go the same way.
 
     Attributes:
-        has_columns: Whether steps have a layout of their own.
         unsent: The frames of the last answer if the client must fetch it.
         was_awake: Whether it has waited awake, so that its client may not have rung.
     """
-
-    has_columns = False
 
     def __init__(
         self,
         attach: m.Attach,
         space: gym.Space[Any] | None,
+        step: Callable[[Any], Any],
+        complete: Callable[[Any], Sequence[Any]],
+        pack: Callable[[m.Message], list[Any]],
         fds: list[int],
         read: Callable[[list[Any]], m.Message],
-        answer: Callable[[m.Message, Callable[[m.Message], bool]], list[Any]],
+        answer: Callable[[m.Message], list[Any]],
         raised: Callable[[BaseException, str], m.RaisedException],
         warned: Sequence[Any],
         watches: Watches,
     ) -> None:
         self._space = space
+        self._do_step, self._complete, self._pack = step, complete, pack
         self.number = attach.env
         self.unsent: list[Any] = []
         self.was_awake = False
@@ -200,10 +203,33 @@ class Lane:
         return size
 
     def _run_message(self, length: int) -> tuple[int, int]:
-        self._told[slabs.OFFERED] = 0
-        frames = self.unsent = self._answer(self._request_of(length), self._write_columns)
-        if not frames:
+        self._told[slabs.OFFERED], self.unsent = 0, []
+        count, (known, actions) = self._asked[slabs.WRITTEN], self._step
+        if known == count:  # the client has only written new actions into its last message
+            return self._step_with(actions.copy())  # an environment may keep its action
+        request = self._request_of(length, count)
+        if type(request) is m.Step:
+            return self._step_with(request.actions)
+        return self._send(self._answer(request))
+
+    def _step_with(self, actions: Any) -> tuple[int, int]:
+        """Step; the results go into columns if they have their form, else in a message."""
+        # First as the environment returned them: what has the form of checked results needs no
+        # check of its own.
+        result = self._do_step(actions)
+        if type(result) is tuple and self._write_columns(result):
             return slabs.COLUMNS, self._scalars
+        values = self._complete(result)
+        if values is not result and self._write_columns(values):
+            return slabs.COLUMNS, self._scalars
+        self._offer(values)
+        frames = self._pack(m.StepDone(*values))
+        if self._watched:
+            self._watches.look()
+        return self._send(frames)
+
+    def _send(self, frames: list[Any]) -> tuple[int, int]:
+        self.unsent = frames
         if self._warned or self._changed:
             return slabs.FETCH, 0
         if self._asked[slabs.TO_SLOT]:
@@ -219,10 +245,7 @@ class Lane:
     def _slot(self) -> int:
         return (self._asked[slabs.TO_SLOT] - 1) * self._slot_bytes
 
-    def _request_of(self, length: int) -> m.Message:
-        count, (known, actions) = self._asked[slabs.WRITTEN], self._step
-        if known == count:  # the client has only written new actions into its last message
-            return m.Step(self.number, actions.copy())  # an environment may keep its action
+    def _request_of(self, length: int, count: int) -> m.Message:
         start = self._message
         frames = read_packet(self._requested[start : start + length], DEFAULT_LIMITS)
         request = self._read(frames)
@@ -232,25 +255,28 @@ class Lane:
             self._step = count, np.ndarray(array.shape, array.dtype, self._request, start)
         return request
 
-    def _write_columns(self, reply: m.Message) -> bool:
-        """Write a step's results if they have the form of the columns. Otherwise offer new columns,
-        the more rarely the more results in a row had other forms.
-        """
-        if type(reply) is not m.StepDone or not self._asked[slabs.TO_SLOT]:
-            return False
-        if (self._watched or self._warned) and self._has_more_to_say():
-            return False
+    def _fills_slot(self) -> bool:
+        """Whether a step's answer goes into a slot, with nothing in front of it."""
+        says_more = (self._watched or self._warned) and self._has_more_to_say()
+        return bool(self._asked[slabs.TO_SLOT]) and not says_more
+
+    def _write_columns(self, values: Sequence[Any]) -> bool:
+        """Write a step's results if they have the form of the columns; returns whether they do."""
         derived, columns = self._columns
-        values = m.values_of(reply)
-        if columns is not None and self._asked[slabs.DERIVED] == derived:
-            try:
-                packed = columns.write(values, self._observations, self._slot)
-            except IrregularError:
-                pass
-            else:
-                self._scalars = self._put(packed) if packed else 0
-                self._missed, self._offers_at = 0, 2
-                return True
+        if columns is None or self._asked[slabs.DERIVED] != derived or not self._fills_slot():
+            return False
+        try:
+            packed = columns.write(values, self._observations, self._slot)
+        except IrregularError:
+            return False
+        self._scalars = self._put(packed) if packed else 0
+        self._missed, self._offers_at = 0, 2
+        return True
+
+    def _offer(self, values: Sequence[Any]) -> None:
+        """Offer columns for such results, the more rarely the more in a row had other forms."""
+        if not self._fills_slot():
+            return
         missed = self._missed = self._missed + 1
         if missed >= self._offers_at:
             self._offers_at = missed + 1 + min(missed // 8, _SELDOM)
@@ -259,7 +285,6 @@ class Lane:
                 self._columns = self._asked[slabs.SEQUENCE], columns
                 self._told[slabs.OFFERED] = columns.digest
                 self._offers_at = missed + min(missed + 1, _SELDOM)
-        return False
 
     def leave_slot(self) -> None:
         """Stop writing into the slot, which the caller may hold: the next batch is a message."""
@@ -291,14 +316,9 @@ class ColumnLane(Lane):
     Args:
         env: The sub-environments.
         attach: As for ``Lane``; also the shard's rows in the batch.
-        pack: Encodes infos as frames.
     """
 
-    has_columns = True
-
-    def __init__(
-        self, env: SubEnvs, pack: Callable[[m.Message], list[Any]], attach: m.Attach, *args: Any
-    ) -> None:
+    def __init__(self, env: SubEnvs, attach: m.Attach, *args: Any) -> None:
         layout = slabs.layout_of(env.single_action_space, env.num_envs)
         observed = slabs.observation_layout(
             env.single_observation_space, attach.count, attach.slots
@@ -313,7 +333,7 @@ class ColumnLane(Lane):
         self._codes: list[int] = []  # dtype codes of the actions, as they were read last
         self._takes: list[Callable[[], Any]] = []  # reads one leaf each, by these codes
         self._pairs: Pairs = []  # the last step's infos, in case the client fetches them
-        self._writer = InfoWriter(self._reply, slabs.INFOS, layout.count, pack, env.joined)
+        self._writer = InfoWriter(self._reply, slabs.INFOS, layout.count, self._pack, env.joined)
         self._move(attach.start, observed)
 
     def _move(self, start: int, observed: slabs.ObservationLayout) -> None:

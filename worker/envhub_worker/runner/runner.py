@@ -170,21 +170,15 @@ class Runner:
         except Exception as error:  # of a class that is not to be had here, for instance
             return raised(error, "arguments", self._snapshot)
 
-    def _reply_to(
-        self, request: m.Message, written: Callable[[m.Message], bool] | None = None
-    ) -> list[Any]:
-        """Like ``reply``, for a decoded request. Returns no frames if ``written``, the lane's own
-        writer, has written the reply.
+    def _reply_to(self, request: m.Message, *, in_columns: bool = False) -> list[Any]:
+        """Like ``reply``, for a decoded request.
+        ``in_columns``: whether observations lie in a slab already.
         """
         self._stage = type(request).__name__.lower()
         try:
             reply = _HANDLERS[type(request)](self, request)
-            if written is not None:
-                if written(reply):
-                    return []
-                lane = self.lanes.get(getattr(request, "env", -1))
-                if isinstance(reply, m.ResetDone) and lane and lane.has_columns:
-                    reply = m.Value(reply.info)  # the observation lies in the slab already
+            if in_columns and isinstance(reply, m.ResetDone):
+                reply = m.Value(reply.info)
             return (self._pack_infos if type(request) in _WITH_INFOS else self._pack)(reply)
         except ResultError as error:
             return m.pack(raised(error, "return", self._snapshot))
@@ -280,17 +274,14 @@ class Runner:
 
     def step(self, request: m.Step) -> m.Message:
         """``VectorEnv.step``."""
-        env = self._envs[request.env]
-        if not isinstance(env, SubEnvs):
-            actions = _restored(env, request.actions)
-            return m.StepDone(*compat.step_result(env, _call_own(env, "step", actions)))
-        return _step_done(env, env.run_step(request.actions))
+        step, complete = _stepping(self._envs[request.env])
+        return m.StepDone(*complete(step(request.actions)))
 
     def revive(self, request: m.Revive) -> m.Message:
         """Reset sub-environments that replace dead ones: see ``m.Revive``."""
         env = self._envs[request.env]
         if isinstance(env, SubEnvs):
-            return _step_done(env, env.run_revive(request.seeds, request.rollout))
+            return m.StepDone(*_results(env, env.run_revive(request.seeds, request.rollout)))
         observation, info = compat.reset_result(env, env.reset(seed=request.seeds))
         no, yes = np.zeros(env.num_envs, np.bool_), np.ones(env.num_envs, np.bool_)
         return m.StepDone(observation, np.zeros(env.num_envs), no, yes, info)
@@ -298,20 +289,22 @@ class Runner:
     def attach(self, request: m.Attach) -> m.Message:
         """Serve an environment's steps over slabs from now on."""
         env = self._envs[request.env]
-        space = None if request.count else getattr(env, "single_observation_space", None)
+        in_columns = request.count > 0
         options: tuple[Any, ...] = (
-            space,
+            None if in_columns else getattr(env, "single_observation_space", None),
+            *_stepping(env),
+            self._pack_infos,
             self.descriptors,
             self.read,
-            self._reply_to,
+            partial(self._reply_to, in_columns=in_columns),
             partial(raised, root=self._snapshot),
             self.warned.pending,
             self.watches,
         )
-        if not request.count:
+        if not in_columns:
             lane = Lane(request, *options)
         elif isinstance(env, SubEnvs) and not env.reward_shape:
-            lane = ColumnLane(env, self._pack_infos, request, *options)
+            lane = ColumnLane(env, request, *options)
         else:
             return m.Value(False)
         if request.env in self.lanes:  # another runner has refused it
@@ -483,18 +476,26 @@ def _call_own(env: Any, method: str, *args: Any, **kwargs: Any) -> Any:
 
 def _restored(env: Any, actions: Any) -> Any:
     """Gives actions the classes that Gymnasium gives them."""
-    single, batched = (getattr(env, name, None) for name in ("single_action_space", "action_space"))
+    single = getattr(env, "single_action_space", None)
     if single is None or not batches.restores(single):
         return actions
+    batched = getattr(env, "action_space", None)
     if batched is not None and not batches.is_batch(batched, single, int(env.num_envs)):
         return batches.restore(batched, actions)
     return batches.restore_batch(single, actions)
 
 
-def _step_done(env: SubEnvs, pairs: Pairs) -> m.Message:
+def _stepping(env: Any) -> tuple[Callable[[Any], Any], Callable[[Any], tuple[Any, ...]]]:
+    """Functions that step an environment, and make the fields of ``StepDone`` of the result."""
+    if isinstance(env, SubEnvs):
+        return (lambda actions: _results(env, env.run_step(actions))), tuple
+    own = partial(_call_own, env, "step")
+    return (lambda actions: own(_restored(env, actions))), partial(compat.step_result, env)
+
+
+def _results(env: SubEnvs, pairs: Pairs) -> tuple[Any, ...]:
     batch, infos = env.batch, env.joined(pairs)
-    flags = (batch.rewards, batch.terminations, batch.truncations)
-    return m.StepDone(batch.observation(), *flags, infos)
+    return batch.observation(), batch.rewards, batch.terminations, batch.truncations, infos
 
 
 def _caller(env: Any) -> Callable[..., Any]:

@@ -413,7 +413,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         """
         if not (self.apart or self.sliced):
             try:
-                return batches.join_pairs(pairs, self.num_envs)
+                return batches.join_pairs(pairs, self.num_envs) if pairs else {}
             except Exception:
                 self.forget_ends()
                 raise

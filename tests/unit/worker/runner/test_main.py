@@ -50,7 +50,9 @@ def slab_lane() -> tuple[Lane, Any, Any]:
     bells = [os.memfd_create("bell") for _ in range(2)]
     others: Any = [None, None, raised]
     attach = m.Attach(1, 0, 0, 1)
-    return Lane(attach, None, [*memory, *bells], *others, (), Watches()), request, reply
+    steps: Any = [None] * 3
+    lane = Lane(attach, None, *steps, [*memory, *bells], *others, (), Watches())
+    return lane, request, reply
 
 
 def test_a_lane_that_is_closed_owes_nothing(slab_lane: tuple[Lane, Any, Any]) -> None:
