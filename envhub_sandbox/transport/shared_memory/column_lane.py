@@ -20,7 +20,6 @@ from envhub_sandbox.transport.shared_memory.client_slabs import (
     ObservationSlab,
     Outcome,
     SlotRing,
-    Wishes,
     action_layouts,
 )
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
@@ -51,7 +50,6 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
         )
         slots = [self.observations] * len(layouts)
         super().__init__(layouts[0], self.observations, relay, layouts, slots, attachment)
-        self._wishes: list[Wishes] = [(0, 0, 0)] * len(layouts)  # for the next step
         self._steps = 0  # so far, for ``traffic``
         self._step_bytes = sum(one.action_bytes for one in layouts), observed.batch_bytes
 
@@ -100,14 +98,6 @@ class ColumnLane(ColumnSteps, SharedMemoryLane):
         self.observations.prepare()
         if len(self.shards) == 1:
             shard.prepare()
-
-    def _plan(self, slot: int) -> None:
-        """Plan where the shards write a batch, and how they wait for the request after it."""
-        spin_ns = self._step_spin.budget_ns
-        cpus = self._cores.of_shards(spin_ns > 0)
-        self._wishes = [
-            (slot, spin_ns if index < self._awake else 0, cpu) for index, cpu in enumerate(cpus)
-        ]
 
     def _outcomes(self, deadline: Deadline) -> tuple[list[Outcome], dict[int, WorkerDiedError]]:
         deaths = self._wait_for_all(deadline)

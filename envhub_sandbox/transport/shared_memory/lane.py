@@ -24,6 +24,7 @@ from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.client_slabs import (
     LaneShard,
     SlotRing,
+    Wishes,
     message_layouts,
 )
 from envhub_sandbox.transport.shared_memory.slab_lane import STEP, SlabLane
@@ -82,6 +83,7 @@ class SharedMemoryLane(SlabLane):
         self._spin = self._step_spin = SpinChooser(may_spin)  # ``_spin``: that of the last request
         self._talk_spin = SpinChooser(may_spin)  # messages take longer than steps
         self._checked: list[Any] | None = None  # fields of a step that needs no check
+        self._wishes: list[Wishes] = [(0, 0, 0)] * len(self.shards)  # for the next step
         self._listens = False  # whether the runners ring although nobody waits: ``sources``
         # One core is the client's. Shards without a core of their own (the sleepers) sleep until a
         # request comes, then run on the client's core while it sleeps. So the client sleeps for
@@ -183,14 +185,21 @@ class SharedMemoryLane(SlabLane):
             self._asked_ns = perf_counter_ns()
             self._spin = self._step_spin
             ring.choose()
-            spin_ns = self._spin.budget_ns
-            cpus = self._cores.of_shards(spin_ns > 0)
-            if shard.write_actions(actions, (0, spin_ns, cpus[0]), ring):
+            if shard.write_actions(actions, self._wishes[0], ring):
                 shard.announce()
+                self._plan(0)  # the shard computes meanwhile, so nobody waits for this
                 return
         super().send_step(actions, ahead=ahead)
         if not others and self._asked == STEP:
             shard.note_actions(actions)
+
+    def _plan(self, slot: int) -> None:
+        """Plan where the shards write a batch, and how they wait for the request after it."""
+        spin_ns = self._step_spin.budget_ns
+        cpus = self._cores.of_shards(spin_ns > 0)
+        self._wishes = [
+            (slot, spin_ns if index < self._awake else 0, cpu) for index, cpu in enumerate(cpus)
+        ]
 
     def _send_to_all(
         self, operation: str, packed: Sequence[Frames], *, ahead: bool = False
