@@ -52,7 +52,9 @@ denials = find_extra("denials.recorder")
 def run(control: int, output: int, common: Common) -> NoReturn:
     """Be the init of a jail in this freshly forked child of the zygote. Never returns."""
     # In this order: the zygote's signal handlers go first, for they would write into its pipe.
-    # Then our end is tied to the zygote's, before anything can hold us up. The output is the
+    # Then our end is tied to the zygote's, before anything can hold us up. The session is that of
+    # all runners: Linux divides busy cores among sessions (``sched(7)``, autogroup), and each
+    # runner with its own would queue behind other programs at every step. The output is the
     # jail's before the first line that may print. Only what is named stays open: what else a fork
     # has inherited belongs to the zygote. The specification is read last, when no descriptor is
     # left that it could leak through.
@@ -62,6 +64,7 @@ def run(control: int, output: int, common: Common) -> NoReturn:
         # Without a pid namespace init must live long enough to end what it started.
         signum = signal.SIGKILL if common.namespaced else signal.SIGTERM
         process.die_with_parent(common.pid, signum)
+        os.setsid()
         os.dup2(output, 1)
         os.dup2(output, 2)
         process.close_all_but({0, 1, 2, control})
@@ -285,13 +288,13 @@ class Init:
         if ended and not self._runners:
             reap.kill_descendants()  # daemons do not outlive the last runner
 
-    def _end_orphans(self, session: int) -> None:
+    def _end_orphans(self, group: int) -> None:
         """End the orphans of a runner while others go on. Daemons end with the last runner."""
-        # A runner leads a session (``runner_entry.confine``), whose number its children have. Only
-        # a daemon begins a session of its own.
+        # A runner leads a process group (``runner_entry.confine``), whose number its children have.
+        # Only a daemon, or a shell's job, begins a group of its own.
         for pid in procfs.descendants(os.getpid(), keep=self._runners):
             with contextlib.suppress(ProcessLookupError):
-                if os.getsid(pid) == session:
+                if os.getpgid(pid) == group:
                     os.kill(pid, signal.SIGKILL)
 
     def _reason(self, signum: int | None) -> tuple[Reason, str]:

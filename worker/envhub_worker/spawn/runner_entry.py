@@ -145,13 +145,13 @@ def _resolve(target: str) -> Callable[[socket.socket, JailSpec, list[int]], int 
 
 def confine(jail: JailContext, fds: list[int], init: Channel) -> None:
     """Give up every right that the jail does not need."""
-    # In this order: the end of init is our end from the first line on. A session of our own is
-    # what init ends orphans by. The control group is joined before anything is allocated that it
+    # In this order: the end of init is our end from the first line on. A process group of our own
+    # is what init ends orphans by. The control group is joined before anything is allocated that it
     # should count, and while its descriptors are open: the next line but one closes them. The
     # environment is built while the zygote's can still be read. ``runner.enter`` is last; it has
     # an order of its own, and after it there is nothing left to give up.
     process.die_with_parent(jail.init)
-    os.setsid()
+    os.setpgid(0, 0)
     for group in jail.joins:
         os.write(group, b"0")  # this process, which has one thread
     process.reset_signals(reap.HANDLED)

@@ -100,6 +100,14 @@ def test_runners_draw_different_random_numbers(cell: Cell) -> None:
     assert first_draw["result"][1] != second_draw["result"][1]
 
 
+def test_runners_share_a_session_and_lead_groups_of_their_own(cell: Cell) -> None:
+    """Linux divides busy cores among sessions: with one each, every wake-up would queue."""
+    source = "import os; result = [os.getsid(0), os.getpgrp() == os.getpid()]"
+    first, second = cell.run(source)["result"], cell.run(source, cell.start())["result"]
+    assert first == second == [first[0], True]
+    assert first[0] > 0  # 0 would be a session from outside of the jail
+
+
 @pytest.mark.parametrize("killed", [True, False])
 def test_a_runner_that_ends_takes_children_along(cell: Cell, folder: Path, killed: bool) -> None:
     second = cell.start()
