@@ -311,7 +311,7 @@ class Launcher:
         if not isinstance(reply, m.LoadDone):
             raise LoadError(f"the worker answered Load with {type(reply).__name__}")
         elements = self.repository.policy.limits.elements
-        in_time = partial(_refuse_late, deadline)
+        in_time = partial(deadline.check, "the worker's manifest could not be read in time")
         manifest = decode_manifest(
             reply.manifest, max_elements=elements, check=in_time, generator=generator
         )
@@ -471,8 +471,3 @@ def _is_what(value: object, task: EnvManifest) -> bool:
     if type(value) is not tuple or tuple(map(type, value)) != (int, bool):
         return False  # arrays, for instance, compare to something else than a bool
     return value == (task.num_envs, task.shardable)
-
-
-def _refuse_late(deadline: Deadline) -> None:
-    if deadline.passed:
-        raise WorkerTimeoutError("the worker's manifest could not be read in time")

@@ -263,8 +263,7 @@ class WorkerConnection:
             else:
                 self._sent.pop(reply_id, None)
                 self.stale_replies += 1
-            if deadline.passed:  # a flood of other replies must not extend the wait
-                raise WorkerTimeoutError("the worker did not answer in time")
+            deadline.check()  # a flood of other replies must not extend the wait
 
     def arrived(self, request_id: int) -> bool:
         """Whether ``receive`` would return or raise at once. Never waits."""
@@ -338,8 +337,7 @@ class WorkerConnection:
                 raise self._has_ended()
             if self._link is not None:
                 self._link.check(self._link.next_number())
-            if deadline.passed:
-                raise WorkerTimeoutError(f"the worker took no request for {_ROOM_S:.0f} s")
+            deadline.check(f"the worker took no request for {_ROOM_S:.0f} s")
 
     def _has_ended(self) -> WorkerDiedError:
         reason = "" if self._far is None else self._far.why_ended()
@@ -358,8 +356,7 @@ class WorkerConnection:
 
     def _wait(self, request_id: int, deadline: Deadline) -> None:
         while not self._is_readable(request_id, self._wait_ms(deadline)):
-            if deadline.passed:
-                raise WorkerTimeoutError("the worker did not answer in time")
+            deadline.check()
 
     def _is_readable(self, request_id: int, wait_ms: int | None) -> bool:
         """Whether a message is there; raises the error if no reply to this request can come."""

@@ -20,6 +20,7 @@ from __future__ import annotations
 import ctypes
 from time import monotonic
 
+from envhub_sandbox.errors import WorkerTimeoutError
 from envhub_sandbox.system.platform import own_cpus
 from envhub_worker.protocol.shared_memory.words import AVOIDED
 
@@ -61,6 +62,11 @@ class Deadline:
     def passed(self) -> bool:
         """Whether it has come."""
         return self._at is not None and monotonic() >= self._at
+
+    def check(self, text: str = "the worker did not answer in time") -> None:
+        """Raise ``WorkerTimeoutError`` if it has come."""
+        if self.passed:
+            raise WorkerTimeoutError(text)
 
 
 class PartDeadline(Deadline):

@@ -51,11 +51,12 @@ class Encoder:
             # Lone surrogates are not UTF-8. They arrive as the text "\\udc80", visibly.
             self.writer = None
             document = msgpack.packb(value, **options, unicode_errors="backslashreplace")
-        wire.check_document(document, self.limits)
         prefix = wire.DOCUMENT_BYTES.pack(len(document))
-        if self.writer is None:
-            return [prefix + document]
-        return [b"".join((prefix, document, *self.writer.tail)), *self.writer.frames]
+        frames: list[Buffer] = [prefix + document]
+        if self.writer is not None:
+            frames = [b"".join((prefix, document, *self.writer.tail)), *self.writer.frames]
+        wire.check_outgoing(document, frames, self.limits)
+        return frames
 
     def default(self, value: Any) -> object:
         """Returns what msgpack packs in place of ``value``."""
@@ -192,13 +193,10 @@ def encode(
     """
 
     def send(part: object) -> list[Buffer]:
-        frames = Encoder(pickler, limits, describer).frames(part)
-        if reduces:
-            wire.check_outgoing_frames(frames, limits)
-        return frames
+        return Encoder(pickler, limits, describer).frames(part)
 
     try:
-        frames = send(value)
+        return send(value)
     # The object's own code runs here (__array__, iteration) and can raise anything.
     except Exception as error:
         from envhub_worker.protocol.codec.unsendable import explain, reduced
@@ -207,5 +205,3 @@ def encode(
             with contextlib.suppress(Exception):
                 return send(reduced(value, send, limits))
         raise LocalProtocolError(explain(value, error, limits, send, names)) from error
-    wire.check_outgoing_frames(frames, limits)
-    return frames

@@ -51,8 +51,9 @@ TENSOR_DTYPES = {
 }  # fmt: skip
 
 
-def check_outgoing_frames(frames: Sequence[Buffer], limits: WireLimits) -> None:
-    """Raises ``LocalProtocolError`` for frames that the receiver will not accept."""
+def check_outgoing(document: bytes, frames: Sequence[Buffer], limits: WireLimits) -> None:
+    """Raises ``ProtocolError`` for a message that the receiver will not accept."""
+    check_document(document, limits)
     try:
         _check_sizes(frames, limits)
     except MessageTooLargeError as error:
