@@ -1,9 +1,9 @@
-"""Has a jail build a wheel: ``python -I -m envhub_sandbox.extras.wheel_builder FOLDER``.
+"""Has a jail build a wheel: ``python -I -m envhub_sandbox.extras.wheel_builder OWNER``.
 
-``extras.packages.builds`` starts it, since packages know no sandboxes. The folder has the sources
-and ``order.json``. The result is printed as JSON: ``wheel``, the name of the file in ``wheel/``;
-``requires``, further requirements of the backend; or ``failed``, the build's output. This process
-ends with the one that started it.
+``extras.packages.builds`` starts it, since packages know no sandboxes. It reads its order from
+stdin and prints the result, both as JSON: ``wheel``, the name of the file in ``wheel/``;
+``requires``, further requirements of the backend; ``failed``, the build's output; or
+``unconfined``, why there is no jail. This process ends with the one that started it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    SandboxUnavailableError,
+    WorkerDiedError,
+    WorkerTimeoutError,
+)
 from envhub_sandbox.extras.wheel_builder import entry as build_entry
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.snapshot import local
@@ -33,10 +38,11 @@ from envhub_worker.protocol.runtime import Runtime
 _PIECE = 16 * 2**20
 
 
-def main(folder: Path, ended: int) -> int:
-    """Carry out the order in a folder, and print the result; returns the exit code."""
+def main(ended: int) -> int:
+    """Carry out the order on stdin, and print the result; returns the exit code."""
     end_with(ended, 10.0)
-    order = json.loads((folder / "order.json").read_text())
+    order = json.load(sys.stdin)
+    folder = Path(order["folder"])
     os.environ[CACHE_VARIABLE] = str(folder / "cache")  # it goes with the folder
     try:
         reply = _built(folder, order)
@@ -44,8 +50,10 @@ def main(folder: Path, ended: int) -> int:
         reply = {"failed": f"it was not done after {order['wall_s']:.0f} s, and was ended"}
     except WorkerDiedError as error:
         reply = {"failed": f"it was ended: {error}"}
+    except SandboxUnavailableError as error:
+        reply = {"unconfined": str(error)}
     except EnvHubError as error:
-        reply = {"error": type(error).__name__, "said": str(error)}
+        reply = {"error": str(error), "reason": ""}
     print(json.dumps(reply))
     return 0
 
@@ -111,4 +119,4 @@ def _repository(folder: Path, order: Mapping[str, Any]) -> Repository:
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1]), int(sys.argv[2])))
+    sys.exit(main(int(sys.argv[1])))

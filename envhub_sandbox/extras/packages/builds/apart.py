@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,41 +35,47 @@ def fetch(url: str, sha256: str, archive: Path, tree: Path, title: str) -> Path:
     ``archive``: the temporary path of the download. Raises ``DependencyError``.
     """
     order = {"url": url, "sha256": sha256, "archive": str(archive), "tree": str(tree)}
-    return Path(_asked({"title": title, **order}, title))
+    order, doing = order | {"title": title}, f"fetching and reading {title}"
+    return Path(answer_of(__name__, order, DEADLINE_S, doing)["answer"])
 
 
 def check_wheel(wheel: Path, name: str, version: str, interpreter: Interpreter) -> None:
     """Runs ``wheels.check`` in a separate process."""
-    order = {"wheel": str(wheel), "name": name, "version": version}
-    _asked({**order, "interpreter": vars(interpreter)}, f"the wheel of {name}")
+    order: dict[str, Any] = {"wheel": str(wheel), "name": name, "version": version}
+    order["interpreter"] = vars(interpreter)
+    answer_of(__name__, order, DEADLINE_S, f"reading the wheel of {name}")
 
 
-def _asked(order: dict[str, Any], title: str) -> str:
+def answer_of(
+    module: str, order: Mapping[str, Any], timeout_s: float, doing: str
+) -> dict[str, Any]:
+    """Has a program of ours carry out an order; returns its answer. Both are JSON.
+
+    ``doing``: the order in words, for errors. The program ends with this process.
+    Raises ``DependencyError``: the answer is an error, or there is none in time.
+    """
     with pidfd() as ourselves:
         try:
             done = subprocess.run(
-                [*program(__name__), str(ourselves)],
+                [*program(module), str(ourselves)],
                 input=json.dumps(order).encode(),
                 capture_output=True,
                 pass_fds=(ourselves,),
                 start_new_session=True,
-                timeout=DEADLINE_S,
+                timeout=timeout_s,
             )
         except subprocess.TimeoutExpired:
-            raise DependencyError(
-                f"{title} was not fetched and read within {DEADLINE_S:.0f} s, so it is not used",
-                reason="integrity",
-            ) from None
+            text = f"{doing} took longer than {timeout_s:.0f} s, so it is not used"
+            raise DependencyError(text, reason="integrity") from None
     try:
-        answer: dict[str, str] = json.loads(done.stdout)
+        answer: dict[str, Any] = json.loads(done.stdout)
     except ValueError:
         shown = printable(done.stderr.decode("utf-8", "replace")[-_SHOWN:], _SHOWN)
-        raise DependencyError(
-            f"{title} cannot be read: the process that reads it ended ({done.returncode}).\n{shown}"
-        ) from None
+        text = f"{doing}: its process ended ({done.returncode}).\n{shown}"
+        raise DependencyError(text) from None
     if "error" in answer:
         raise DependencyError(answer["error"], reason=known_reason(answer["reason"]))
-    return answer["answer"]
+    return answer
 
 
 def main(owner: int) -> int:

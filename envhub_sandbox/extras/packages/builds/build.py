@@ -6,9 +6,7 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
-import subprocess
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -18,7 +16,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from envhub_sandbox import errors
 from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.extras.packages import environments, interpreters
 from envhub_sandbox.extras.packages.builds import apart, download, project, wheels
@@ -29,7 +26,6 @@ from envhub_sandbox.extras.packages.request import PackageRequest, Tell
 from envhub_sandbox.extras.packages.resolution.pylock import Lock
 from envhub_sandbox.extras.packages.resolution.resolve import MOST_SOURCES
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.system.platform import pidfd, program
 from envhub_worker.protocol.runtime import OWN
 from envhub_worker.protocol.text import printable
 
@@ -46,58 +42,37 @@ class BuildFailedError(DependencyError):
     """The build backend failed or was ended; the text is the end of its output."""
 
 
-def _in_jail(order: Mapping[str, Any], folder: Path) -> Path | tuple[str, ...]:
+def _in_jail(order: Mapping[str, Any], folder: Path, title: str) -> Path | tuple[str, ...]:
     """Returns a wheel below an empty folder, or the further requirements of the build backend.
 
     Trust: both are a stranger's, unchecked. ``extras.wheel_builder`` reads the order; this function
     adds limits, profile and readable folders. Raises ``BuildFailedError``, or ``DependencyError``
     where this host cannot start a jail.
     """
-    answer = _run(order, folder)
-    further, name = answer.get("requires"), answer.get("wheel")
-    if isinstance(further, list) and 0 < len(further) <= _MOST_REQUIRED:
-        return tuple(text for text in further if isinstance(text, str))
-    if not isinstance(name, str):
-        raise BuildFailedError("its build backend produced no wheel")
-    return folder / "wheel" / os.path.basename(name)
-
-
-def _run(order: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     whole = {
         **order,
+        "folder": str(folder),
         "readable": [order["source"], order["packages"], str(folder / "tools")],
         "limits": LIMITS,
         "wall_s": WALL_S,
         "max_bytes": MAX_BYTES,
         "profile": os.environ.get(PROFILE_VARIABLE) or "strict",
     }
-    (folder / "order.json").write_text(json.dumps(whole))
-    with pidfd() as ourselves:
-        done = subprocess.run(
-            [*program(_PROGRAM), str(folder), str(ourselves)],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            pass_fds=(ourselves,),
-            start_new_session=True,
-            timeout=WALL_S + _AROUND_S,
+    answer = apart.answer_of(_PROGRAM, whole, WALL_S + _AROUND_S, f"building {title}")
+    if "unconfined" in answer:
+        raise DependencyError(
+            f"sources are built in a jail, and there is none here: {answer['unconfined']}. A "
+            f"weaker profile for builds is chosen by {PROFILE_VARIABLE}, as in "
+            f"{PROFILE_VARIABLE}=no-userns"
         )
-    try:
-        answer: dict[str, Any] = json.loads(done.stdout)
-    except ValueError as error:
-        shown = printable(done.stderr.decode("utf-8", "replace")[-_SHOWN:])
-        raise DependencyError(f"the program that builds failed:\n{shown}") from error
-    if "error" in answer:
-        kind = getattr(errors, str(answer["error"]), DependencyError)
-        text = str(answer["said"])
-        if issubclass(kind, errors.SandboxUnavailableError):
-            raise DependencyError(
-                f"sources are built in a jail, and there is none here: {text}. A weaker profile "
-                f"for builds is chosen by {PROFILE_VARIABLE}, as in {PROFILE_VARIABLE}=no-userns"
-            )
-        raise DependencyError(text)
     if "failed" in answer:
         raise BuildFailedError(printable(str(answer["failed"])[-_SHOWN:], _SHOWN))
-    return answer
+    further, name = answer.get("requires"), answer.get("wheel")
+    if isinstance(further, list) and 0 < len(further) <= _MOST_REQUIRED:
+        return tuple(text for text in further if isinstance(text, str))
+    if not isinstance(name, str):
+        raise BuildFailedError("its build backend produced no wheel")
+    return folder / "wheel" / os.path.basename(name)
 
 
 Choose = Callable[[PackageRequest, Interpreter, Tell], Lock]
@@ -237,7 +212,8 @@ class _Build:
             self._tell(f"building {_title(self._source)} in a jail")
             folder = Path(tempfile.mkdtemp(prefix=f"try-{number}-", dir=self._place))
             folder.chmod(0o755)
-            result = _in_jail(self._order(packages, requirements), folder)
+            order = self._order(packages, requirements)
+            result = _in_jail(order, folder, _title(self._source))
             if isinstance(result, Path):
                 source, interpreter = self._source, self._interpreter
                 apart.check_wheel(result, source.name, source.version, interpreter)
