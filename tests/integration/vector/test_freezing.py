@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from envhub_sandbox import make_env
 from tests.support.compare import assert_same
@@ -70,11 +70,11 @@ def counted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_repository(tmp_path_factory.mktemp("counted"), ENVS)
 
 
-def oracle(n_envs: int, mode: str) -> Any:
+def oracle(n_envs: int, mode: str, kind: type = SyncVectorEnv) -> Any:
     names: dict[str, Any] = {}
     exec(ENVS, names)
     fns = [lambda i=i: Frozen(names["Counted"](3 + 2 * i + i % 2)) for i in range(n_envs)]
-    return SyncVectorEnv(fns, autoreset_mode=AutoresetMode(mode))
+    return kind(fns, autoreset_mode=AutoresetMode(mode))
 
 
 WAYS: dict[str, dict[str, Any]] = {
@@ -89,7 +89,8 @@ WAYS: dict[str, dict[str, Any]] = {
 )
 def test_results_are_those_of_lerobots_wrapper(counted: Path, way: str, mode: str) -> None:
     """Over two rollouts, and a reset without the option in the middle of the second."""
-    theirs = oracle(4, mode)
+    is_async = "use_async_envs" in WAYS[way]
+    theirs = oracle(4, mode, AsyncVectorEnv if is_async else SyncVectorEnv)
     with make_env(counted, n_envs=4, env_kwargs={"mode": mode}, **WAYS[way]) as suites:
         ours = suites.env
         for rollout in range(2):
@@ -104,6 +105,7 @@ def test_results_are_those_of_lerobots_wrapper(counted: Path, way: str, mode: st
                     assert_same(theirs.reset(), ours.reset())
         counts = zip(theirs.get_attr("count"), ours.get_attr("count"), strict=True)
         assert all(theirs == ours for theirs, ours in counts)
+    theirs.close()
 
 
 @pytest.mark.parametrize("way", ["plain", "two workers"])
