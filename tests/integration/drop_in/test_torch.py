@@ -92,9 +92,13 @@ def test_a_first_observation_tells_the_batch_as_an_array_does() -> None:
     assert known(action_space=ROW).single_observation_space.shape == (2,)
 
 
-def test_late_torch_is_looked_at_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its global generator is state that a process has once; a change of it is reported once."""
-    monkeypatch.delitem(sys.modules, "torch")
+@pytest.mark.parametrize("is_late", [False, True])
+def test_a_change_of_its_global_generator_is_reported_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_late: bool
+) -> None:
+    """It is state that a process has once; also where torch is imported after the first look."""
+    if is_late:
+        monkeypatch.delitem(sys.modules, "torch")
     reported: list[str] = []
     state = SharedState(str(tmp_path), reported.append)
     state.look_closely()
@@ -108,7 +112,7 @@ def test_late_torch_is_looked_at_too(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_broken_torch_is_no_workers_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    frames = m.pack(m.Value(torch.zeros(2)))
+    frames = m.pack(m.Value(torch.zeros(2, dtype=torch.bfloat16)))
     (tmp_path / "torch.py").write_text("raise RuntimeError('another numpy')")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "torch")
@@ -116,4 +120,5 @@ def test_broken_torch_is_no_workers_fault(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(DependencyError, match=r"torch is installed here.*another numpy"):
         values.unpacked(frames)
     monkeypatch.undo()
-    assert values.unpacked(frames).value.tolist() == [0, 0]
+    arrived = values.unpacked(frames).value
+    assert (arrived.dtype, arrived.tolist()) == (torch.bfloat16, [0, 0])
