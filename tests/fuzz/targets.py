@@ -161,7 +161,7 @@ def results(dice: Dice) -> None:
             np.zeros(size),
             np.zeros(size, bool),
             np.zeros(size, bool),
-            {"final_obs": final(members[:size]), "_final_obs": np.ones(size, bool)},
+            lasts(members[:size], shardable),
         )
         for observation, size in zip(observations, sizes, strict=True)
     ]
@@ -169,21 +169,24 @@ def results(dice: Dice) -> None:
     if any(type(one[4]) is not dict for one in fields):
         raise NotSentError
     with UNTRUSTED:
-        observation, rewards, over, cut, infos = found.step([m.StepDone(*one) for one in fields])
+        observation, rewards, over, cut, told = found.step([m.StepDone(*one) for one in fields])
     count = stops[-1]
     if shardable:
         fits(space, observation, count)
         per_env("rewards", rewards, "biuf", count)
         per_env("terminations", over, "b", count)
         per_env("truncations", cut, "b", count)
-    usable((observation, rewards, over, cut, infos))
+    usable((observation, rewards, over, cut, told))
 
 
-def final(members: list[Any]) -> Any:
+def lasts(members: list[Any], shardable: bool) -> dict[Any, Any]:
+    """The last observations, as a slice sends them, or joined by a repository's own class."""
+    if shardable:
+        return {row: {"final_obs": member} for row, member in enumerate(members)}
     made = np.full(len(members), None, object)
     for index, member in enumerate(members):
         made[index] = member
-    return made
+    return {"final_obs": made, "_final_obs": np.ones(len(members), bool)}
 
 
 def infos(dice: Dice) -> None:
@@ -241,8 +244,10 @@ def restore(dice: Dice) -> None:
     value, lie = dice.inside([members[0], batch])
     with UNTRUSTED:
         usable(batches.restore(space, value))
+        restored = batches.restore_batch(space, lie)
+        usable(restored)
         if batches.conforms(space, lie, 3):
-            fits(space, batches.restore_batch(space, lie), 3)
+            fits(space, restored, 3)
 
 
 # --- manifests -----------------------------------------------------------------------------------

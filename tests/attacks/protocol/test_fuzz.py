@@ -124,7 +124,7 @@ class Forgetful:
 
 _NAIVE = {"id": "A-v0", "entry_point": "os:system"}
 UNCHECKED: dict[str, tuple[tuple[object, str, object], str]] = {
-    "results": ((results.batches, "conforms", lambda *_: True), "where"),
+    "results": ((results.batches, "conforms", lambda *_: True), "where|another mapping"),
     "unpack": ((message, "Incoming", Forgetful), "another message"),
     "things": ((values, "spec_of", lambda facts: EnvSpec(**_NAIVE)), "an entry point"),
     "tracebacks": ((Snapshot, "known_as", lambda self, path: f'"{path}"'), "another file"),

@@ -159,8 +159,11 @@ def test_only_graphs_need_their_classes_back(name: str) -> None:
 @pytest.mark.parametrize("member", [None, 3, (1, 2), {"text": 1}, ({}, {}, {}, {})])
 @pytest.mark.parametrize("name", ["graph", "dict", "tuple", "sequence of graphs"])
 def test_lies_about_members_are_left_as_they_are(name: str, member: object) -> None:
-    """``final_obs`` is not checked against the space; restoring it raises nothing."""
+    """``final_obs`` is not checked against the space, nor is a batch of an own class; restoring
+    them raises nothing.
+    """
     assert batches.restore(SINGLE_SPACES[name], member) == member
+    assert batches.restore_batch(SINGLE_SPACES[name], member) == member
 
 
 def test_few_bytes_make_no_large_column() -> None:
