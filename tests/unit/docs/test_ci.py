@@ -301,7 +301,7 @@ def test_failures_run_alone_thrice(checkout: Path, tmp_path: Path, others: int, 
     done = run(pytest_again, tmp_path, **env)
     assert done.returncode == 1
     at_once = done.stdout.partition("= FAILURES =")[0]
-    assert at_once.count("failed now: ") == 2 + others
+    assert at_once.count("failed now: test_it.py::test_") == 2 + others
     ran = [len((tmp_path / name).read_text()) for name in ("first", "fourth")]
     assert ran == [runs, runs]
     if others:
