@@ -188,8 +188,12 @@ def test_a_listing_names_each_file_once(tmp_path: Path, monkeypatch: pytest.Monk
     tree = store.folder_of("local") / tmp_path.name
     shutil.copytree(tmp_path, tree)
     for root, executable in ((tree, [False, True]), (tmp_path, [False, False])):
-        (root.parent / "record.json").write_text('{"programs": ["sub/b"]}')
+        record = '{"programs": ["sub/b"], "endpoint": "https://a.example"}'
+        (root.parent / "record.json").write_text(record)
         assert [one.executable for one in remote_repository.listing(root)] == executable
+    assert store.endpoint_of(tree) == "https://a.example"
+    with pytest.raises(FileNotFoundError):
+        store.endpoint_of(tmp_path)
     (tmp_path.parent / "record.json").unlink()
     (tmp_path / "gone").symlink_to("nowhere")
     with pytest.raises(errors.SnapshotError, match="cannot be read"):

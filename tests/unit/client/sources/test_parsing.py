@@ -5,6 +5,7 @@ import os
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
@@ -134,19 +135,26 @@ def test_a_file_that_costs_too_much_is_not_read(
     assert parsing.parsed(texts) == {**read, "second.py": None}
 
 
-@pytest.mark.parametrize(("each_takes_s", "most"), [(0.0, parsing.MOST_LOST), (400.0, 2)])
+@pytest.mark.parametrize(
+    ("each_takes_s", "limits_s"), [(0.0, [600.0] * parsing.MOST_LOST), (400.0, [600.0, 200.0])]
+)
 def test_lost_children_are_counted(
-    each_takes_s: float, most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    each_takes_s: float, limits_s: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And have ten minutes together."""
     ended = weaker(tmp_path, ("  tree = ", "  signal.raise_signal(9)\n        tree = "))
     monkeypatch.setattr(parser, "__file__", ended)
-    began: list[object] = []
+    began: list[float] = []
     run = subprocess.run
     monkeypatch.setattr(parsing, "monotonic", lambda: each_takes_s * len(began))
-    monkeypatch.setattr(subprocess, "run", lambda *a, **k: (began.append(a), run(*a, **k))[1])
+
+    def run_child(*arguments: Any, timeout: float, **options: Any) -> object:
+        began.append(timeout)
+        return run(*arguments, timeout=timeout, **options)
+
+    monkeypatch.setattr(subprocess, "run", run_child)
     assert set(parsing.parsed({f"{number}.py": b"" for number in range(1000)}).values()) == {None}
-    assert len(began) == most
+    assert began == limits_s
 
 
 def test_only_a_regular_file_is_read(tmp_path: Path) -> None:
