@@ -25,7 +25,7 @@ from envhub_worker.protocol.records import dataclass
 
 TIMEOUT_S = 20.0
 """The time limit of git: a hostile pattern in ``.gitignore`` can take for ever."""
-_MOST_BYTES = 64 << 10
+_MOST_BYTES = 1 << 20
 """The largest file that this module reads itself."""
 _GIT_FOLDER = Path(__file__).with_name("git_folder")
 _SETTINGS = ("core.fsmonitor=false", "core.untrackedCache=false", f"core.hooksPath={os.devnull}")
@@ -35,8 +35,10 @@ _CONVERSIONS = ("filter", "ident", "working-tree-encoding")
 """Attributes that make a folder's bytes differ from the commit's, apart from line ends."""
 _KEY = r"(?im)(?:^|\])[ \t]*{}[ \t]*=[ \t]*\"?"
 """Where a line of git's configuration sets a key; no blank line is read twice."""
-_SHA256 = _KEY.format("objectformat") + "sha256"
-"""Marks SHA-256 ids in git's configuration; git would misread such an index without an error."""
+_OTHER_IDS = r"(?im)objectformat[ \t]*=(?![ \t]*sha1[ \t]*\r?$)"
+"""Marks other ids than SHA-1 in git's configuration, however it is spelled: the key stands there as
+it is. Git would misread such an index without an error.
+"""
 
 _MODELESS = _KEY.format("filemode") + r"(false|no|off|0)\b"
 """Marks a checkout, as of Windows, whose index says which files are executable."""
@@ -48,7 +50,7 @@ class _Repository(NamedTuple):
     top: Path
     own: Path
     common: Path
-    is_sha256: bool
+    has_other_ids: bool
     is_modeless: bool
 
 
@@ -135,7 +137,7 @@ def read_checkout(folder: Path) -> Checkout | None:
     every user of the machine can make one.
     """
     repository = _repository_of(folder)
-    if repository is None or repository.is_sha256:
+    if repository is None or repository.has_other_ids:
         return None
     # patterns that the checkout's user ignores, beside those of the commit
     exclude = repository.common / "info/exclude"
@@ -154,12 +156,14 @@ def read_checkout(folder: Path) -> Checkout | None:
 
 def is_unread(folder: Path) -> bool:
     """Tells whether a folder lies in a checkout that git cannot read, so that its commit is
-    unknown: git is missing or fails, or the object ids are SHA-256.
+    unknown: git is missing or fails, or the object ids are not SHA-1.
     """
     repository = _repository_of(folder)
     if repository is None:
         return False
-    return repository.is_sha256 or _git(repository, folder, "ls-files", "-z", "--cached") is None
+    return (
+        repository.has_other_ids or _git(repository, folder, "ls-files", "-z", "--cached") is None
+    )
 
 
 def make_checkout(folder: Path) -> None:
@@ -189,7 +193,8 @@ def _repository_of(folder: Path) -> _Repository | None:
         common = own / _text_of(own / "commondir").strip()
         is_one = (own / "HEAD").is_file() and (common / "objects").is_dir()
         config = _text_of(common / "config")
-        marks = [re.search(mark, config) is not None for mark in (_SHA256, _MODELESS)]
+        is_cut = len(os.fsencode(config)) == _MOST_BYTES
+        marks = [is_cut or re.search(mark, config) is not None for mark in (_OTHER_IDS, _MODELESS)]
         owners = (folder.stat().st_uid, user_id(), 0)
         is_trusted = (top / ".git").lstat().st_uid in owners
     except (OSError, ValueError):  # also for a path with a null byte

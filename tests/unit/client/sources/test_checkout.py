@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.errors import RepositoryUnavailableError, SnapshotError
+from envhub_sandbox.extras.sources import checkout
 from envhub_sandbox.hub.local import IGNORED, REPOSITORY, LocalFolder
 from envhub_sandbox.hub.snapshot import local
 from tests.hub.olah_server import GitRepository
@@ -182,15 +183,37 @@ def test_a_folder_in_a_checkout_is_a_part_of_it(repository: GitRepository) -> No
     assert set(files(repository.folder / "build")) == {"env.py", "b.log"}
 
 
-def test_with_other_hashes_everything_counts(tmp_path: Path, snapshot_store: Path) -> None:
-    """Git would read its index wrongly, without an error, and no Hub has such ids."""
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "[extensions]\n\tobjectformat = sha256\n",
+        "[extensions]\robjectFormat=sha256\r",
+        "[extensions]\nobjectformat = sha\\\n256\n",
+        '[extensions]objectformat\t= sha"256" # sha1\n',
+        "#" * (1 << 20) + "\n[extensions]\nobjectformat = sha256\n",
+    ],
+    ids=["git's own", "carriage returns", "continued", "partly quoted", "after a MiB"],
+)
+def test_with_other_hashes_everything_counts(
+    tmp_path: Path, snapshot_store: Path, setting: str
+) -> None:
+    """No Hub has such ids. With ours, git would read another name in this index, without an error:
+    the bytes of the id of ten x where it expects length and name.
+    """
     folder = tmp_path / "sha256"
+    command = ["git", "-C", folder]
     subprocess.run(["git", "init", "--quiet", "--object-format=sha256", folder], check=True)
+    config = folder / ".git/config"
+    config.write_bytes(f"[core]\nrepositoryformatversion = 1\n{setting}".encode())
     for name in ("env.py", "forced.pyc", "other.pyc"):
-        (folder / name).write_text("")
-    subprocess.run(["git", "-C", folder, "add", "env.py", "forced.pyc"], check=True)
+        (folder / name).write_text("x" * 10)
+    subprocess.run([*command, "add", "forced.pyc"], check=True)
     (folder / ".gitignore").write_text("*.pyc\n")
+    assert subprocess.check_output([*command, "ls-files", "--cached"]) == b"forced.pyc\n"
     assert set(files(folder)) == {".gitignore", "env.py", "forced.pyc", "other.pyc"}
+    assert checkout.is_unread(folder)
+    config.write_bytes(b"[extensions]\nobjectformat = sha1\r\n")
+    assert not set(files(folder)) >= {"forced.pyc", "other.pyc"}
 
 
 SPOIL = {
