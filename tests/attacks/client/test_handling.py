@@ -24,6 +24,7 @@ from envhub_sandbox.transport import results
 from envhub_worker.protocol import errors
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
+from envhub_worker.protocol.spaces import batches
 from tests.attacks.client.lies import ACTIONS, opened, relayed, started
 from tests.attacks.client.lying_server import (
     NUM_ENVS,
@@ -234,11 +235,14 @@ def test_odd_graph_observations(
                     suites.env.step(ACTIONS)
 
 
-def test_masks_longer_than_their_values_are_refused() -> None:
-    honest = {"a": np.zeros(1), "_a": np.ones(1, bool)}
+def test_columns_have_a_value_each_and_masks_of_our_own() -> None:
+    def column(values: Any, mask: Any) -> dict[Any, Any]:
+        return {batches.APART_CLASSES: {"a": False}, "a": values, "_a": mask}
+
+    honest = column(np.full(1, 3.0), np.ones(1, bool))
     joins = results.Results(env_manifest(), [(0, 1), (1, NUM_ENVS)])
-    assert joins.infos([honest, honest])["a"].tolist() == [True, True]  # the control
-    for mask in (np.ones(3, bool), np.ones((1, 1), bool), [True, True], None):
-        lie = {"a": np.zeros(1, np.int8), "_a": mask}
+    assert joins.infos([honest, honest])["a"].tolist() == [3, 3]  # the control
+    for lie in (np.ones(3, bool), np.zeros((1, 1), bool), [True, True], None):
+        assert joins.infos([honest, column(np.zeros(1), lie)])["_a"].tobytes() == b"\1\1"
         with pytest.raises(RemoteProtocolError):
-            joins.infos([honest, lie])
+            joins.infos([honest, column(lie, honest["_a"])])
