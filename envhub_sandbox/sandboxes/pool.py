@@ -207,8 +207,9 @@ class ServerPool(Generic[S]):
                 entry.until = None if idle_s is None else monotonic() + idle_s
                 if entry not in self._idle:  # an interrupted release may have added it
                     self._idle.append(entry)
-                self._watch()
-                return True
+                if self._watch():
+                    return True
+                self._idle.remove(entry)
         entry.server.stop()
         return True
 
@@ -233,13 +234,18 @@ class ServerPool(Generic[S]):
         timed = [(entry.until, entry) for entry in self._mine() if entry.until is not None]
         return min(timed, key=itemgetter(0), default=None)
 
-    def _watch(self) -> None:
+    def _watch(self) -> bool:
+        """Start the thread if it is needed; returns whether a limit on threads allows it."""
         self._changed.notify_all()
         if self._thread is None and self._earliest() is not None:
             thread = threading.Thread(target=self._run, name="envhub-idle", daemon=True)
-            thread.start()
+            try:
+                thread.start()
+            except RuntimeError:
+                return False
             # interruption.md, rule 4: noted after its start, so a Ctrl-C leaves none to be joined
             self._thread = thread
+        return True
 
     # --- ending servers --------------------------------------------------------------------------
 

@@ -47,6 +47,7 @@ from envhub_sandbox.system.platform import (
     readable_within,
     user_id,
 )
+from envhub_sandbox.system.threads import starting
 from envhub_worker.protocol.runtime import OWN, Runtime, site_options
 
 BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
@@ -112,7 +113,8 @@ class LocalServer(WorkerServer):
             ready, ready_end = os.pipe()
             try:
                 try:
-                    self._process = start(ready_end)
+                    with starting("a worker server"):
+                        self._process = start(ready_end)
                 finally:
                     os.close(ready_end)
                 if sys.platform == "linux":
@@ -208,7 +210,8 @@ def _start(store: Path, runtime: Runtime) -> LocalServer:
     importing = threading.Thread(target=_import_quietly, name="envhub-import", daemon=True)
     server = LocalServer(SERVER, "", _STOP_S)
     with server.starting(partial(_execute, server, store, runtime)) as ready:
-        importing.start()
+        with starting("a thread"):
+            importing.start()
         remove_stale()
         _wait_until_ready(ready, server)
         importing.join()

@@ -1,4 +1,4 @@
-"""Parallel calls in daemon threads, which nothing has to wait for."""
+"""Parallel calls in daemon threads, which nothing waits for; and starts that a limit refuses."""
 
 from __future__ import annotations
 
@@ -6,13 +6,29 @@ import contextlib
 import queue
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from time import monotonic
 from typing import Generic, TypeVar, cast
+
+from envhub_sandbox.errors import WorkerStartupError
 
 T = TypeVar("T")
 _AT_ONCE = 64
 _LOOK_S = 1.0
+
+
+@contextlib.contextmanager
+def starting(what: str) -> Iterator[None]:
+    """Start threads or a process in it, and nothing else.
+    Raises ``WorkerStartupError``: a limit does not let this process start any.
+    """
+    try:
+        yield
+    except (RuntimeError, BlockingIOError) as error:
+        raise WorkerStartupError(
+            f"this process cannot start {what}: raise the limit on processes and threads "
+            "(ulimit -u; of a service TasksMax=; of a container its pids)"
+        ) from error
 
 
 class Call(Generic[T]):

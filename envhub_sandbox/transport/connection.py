@@ -21,12 +21,12 @@ from envhub_sandbox.errors import (
     VersionMismatchError,
     WorkerDiedError,
     WorkerError,
-    WorkerStartupError,
     WorkerTimeoutError,
 )
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.log import MESSAGES
 from envhub_sandbox.system.platform import OwnerProcess, fork_error_text
+from envhub_sandbox.system.threads import starting
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect_reply
 from envhub_worker.protocol import messages as m
@@ -75,13 +75,9 @@ def _check_threads() -> None:
     checked = threading.Event()
     threads = [threading.Thread(target=checked.wait, daemon=True) for _ in range(_THREADS)]
     try:
-        for thread in threads:
-            thread.start()
-    except RuntimeError as error:
-        raise WorkerStartupError(
-            f"this process cannot start the {_THREADS} threads of ZeroMQ: raise the limit on "
-            "processes and threads (ulimit -u; of a service TasksMax=; of a container its pids)"
-        ) from error
+        with starting(f"the {_THREADS} threads of ZeroMQ"):
+            for thread in threads:
+                thread.start()
     finally:
         checked.set()
         for thread in threads:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from envhub_sandbox.errors import EnvHubError, PolicyError, WorkerTimeoutError
 from envhub_sandbox.system.log import OUTPUT
+from envhub_sandbox.system.threads import starting
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect_reply
 from envhub_worker.protocol import messages as m
@@ -129,7 +130,8 @@ class OutputFollower:
         self._offset = 0  # of the next byte to ask for, in all that the jail has printed
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="envhub-output", daemon=True)
-        self._thread.start()
+        with starting("the thread that reads what a jail prints"):
+            self._thread.start()
 
     def stop(self) -> None:
         """Fetch the rest of the output and stop. Call it before closing the jail. Idempotent."""

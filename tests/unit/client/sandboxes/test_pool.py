@@ -234,6 +234,19 @@ def test_an_idle_one_that_has_died_is_ended_by_the_next(pool: Pool, idle_s: floa
     assert fresh.server.ends == here()
 
 
+def test_without_a_thread_for_the_idle_it_ends_at_once(
+    pool: Pool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", refuse)
+        ended = given_up(pool, "key", 600)
+        assert ended.ends == here()
+    assert given_up(pool, "key", 600) is not ended
+
+
 def test_one_that_ends_delays_no_fresh_one(pool: Pool) -> None:
     """Once its time has come it is not handed on; only the end of the process waits for its end."""
     use = pool.acquire("key", Server, 0.01)

@@ -1,18 +1,21 @@
 """A server that is our child: it ends with what was started for it, however its start went."""
 
+import errno
 import json
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
-from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.extras.docker import leftovers
 from envhub_sandbox.extras.docker.run_arguments import FOLDER_LABEL, USER_LABEL
 from envhub_sandbox.sandboxes import process
@@ -101,6 +104,21 @@ def test_what_fails_in_its_start_ends_it(server: process.LocalServer) -> None:
     with pytest.raises(FileNotFoundError), second.starting(fails):
         pass
     assert (second.stopped, second.folder.exists()) == (True, False)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "error"),
+    [
+        (subprocess.Popen, "__init__", BlockingIOError(errno.EAGAIN, "no process")),
+        (threading.Thread, "start", RuntimeError("can't start new thread")),
+    ],
+)
+def test_a_limit_on_processes_and_threads_is_named(
+    kind: type, name: str, error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kind, name, Mock(side_effect=error))
+    with pytest.raises(WorkerStartupError, match="ulimit -u"):
+        process.PROCESS.acquire(tmp_path)
 
 
 def test_a_fork_of_its_owner_ends_nothing(server: process.LocalServer) -> None:
