@@ -2,7 +2,9 @@
 
 In a jail without a pid namespace, where Landlock cannot scope signals (before ABI 6), the filter
 hands ``kill``, ``tkill`` and ``tgkill`` to init, which sends the signal if the target is a process
-of the jail. Their arguments are numbers in registers, so none can change between check and use.
+of the jail; and ``setpgid``, since init has the session of all runners, and a process in its group
+could signal it with that group. Their arguments are numbers in registers, so none can change
+between check and use.
 Init opens a pidfd of the target before it checks it, so no other process can take over the pid. The
 kernel itself delivers signals of a process to itself: a signal from init would interrupt the very
 call that waits for init's answer.
@@ -64,7 +66,7 @@ _PROCEED = -1
 """In the place of an errno: the kernel makes the call itself. Not None, which is what a path would
 answer that forgets to."""
 _Inside = Callable[[], Collection[int]]
-SIGNALS = ("kill", "tkill", "tgkill")
+SIGNALS = ("kill", "tkill", "tgkill", "setpgid")
 
 
 def serve(listener: int, permitted: Collection[str], note: Callable[[Request], None]) -> bool:
@@ -114,6 +116,8 @@ def decide(request: Request, inside: _Inside) -> int:
     first, second, third = request.arguments
     if request.caller == 0:
         return errno.ESRCH
+    if request.call == "setpgid":
+        return errno.EPERM if second == os.getpgrp() else _PROCEED
     if request.call == "kill":
         return _kill(request.caller, first, second, inside)
     if request.call == "tkill":
@@ -129,7 +133,8 @@ def _kill(caller: int, target: int, signum: int, inside: _Inside) -> int:
     group = _group_of(caller)
     if group < 0:
         return errno.ESRCH  # it has gone since: no caller waits for the answer
-    # A process group of a jail holds its processes only, for the jail has its own session.
+    # A process group of a jail holds its processes only: it has its own session, and ``setpgid``
+    # into init's group is denied.
     if target in (caller, 0, -group):
         return _PROCEED
     if target == -1:

@@ -167,7 +167,7 @@ def policy_table(
     verdicts |= dict.fromkeys(_NAMESPACED.split(), ALLOW) if namespaced else _without_namespaces()
     verdicts |= dict.fromkeys(WITHOUT_ATTRIBUTES, _ENOTSUP)
     if brokered:
-        verdicts |= dict.fromkeys(("kill", "tkill", "tgkill"), ASK)
+        verdicts |= dict.fromkeys(("kill", "tkill", "tgkill", "setpgid"), ASK)
         verdicts["pidfd_send_signal"] = ENOSYS
     return verdicts
 

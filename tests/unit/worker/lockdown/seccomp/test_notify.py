@@ -127,3 +127,10 @@ def test_a_signal_goes_to_processes_of_the_jail_only(way: str) -> None:
     assert other.poll() is None
     other.kill()
     other.wait()
+
+
+@pytest.mark.parametrize(("group", "refused"), [(os.getpgrp(), True), (0, False), (1, False)])
+def test_no_process_joins_the_group_of_init(group: int, refused: bool) -> None:
+    """The kernel itself sends a signal to the caller's group, whoever is in it."""
+    asked = notify.Request(os.getpid(), os.getpid(), "setpgid", (0, group, 0))
+    assert (notify.decide(asked, list) == errno.EPERM) is refused

@@ -222,6 +222,7 @@ CLAIMS: dict[str, list[Row]] = {
     ],
     "signals are handed to init where it sends them; what has no broker is denied or falls back": [
         under(ASK, [(one, 1, 15) for one in ("kill", "tkill", "tgkill")], False, brokered=True),
+        under(ASK, [("setpgid", 0, 1)], False, brokered=True),
         under(EPERM, [("rt_sigqueueinfo", 1, 15)], False, brokered=True),
         under(ENOSYS, [("pidfd_send_signal", 1, 15)], False, brokered=True),
     ],
