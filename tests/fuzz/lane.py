@@ -1,5 +1,6 @@
 """The fast lane's slabs with anything in them: the jail writes what and when it likes."""
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,9 @@ from envhub_sandbox.transport.shared_memory.client_slabs import (
 )
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
+from envhub_worker.protocol.messages.forms import IrregularError
 from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.shared_memory.columns import StepColumns
 from envhub_worker.protocol.shared_memory.packets import packet_bytes, write_packet
 from tests.attacks.client.lying_server import env_manifest
 from tests.fuzz.oracle import demand, fits, per_env, usable
@@ -56,8 +59,9 @@ def lane(dice: Dice) -> None:
     """Outcomes, answers, infos, columns, observations and flags: right, or refused."""
     rng = dice.rng
     if not _SLABS:
-        _SLABS.append(Slabs())
-    ours, shard = _SLABS[0], _SLABS[0].shard
+        _SLABS.extend((Slabs(), Slabs()))
+    ours = rng.choice(_SLABS)
+    shard, steps_in_columns = ours.shard, ours is _SLABS[0]
     words = ours.reply[: slabs.HEADER_BYTES].view(np.uint64)
     if rng.random() < 0.3:
         ours.batch[:] = np.frombuffer(rng.randbytes(ours.batch.nbytes), np.uint8)
@@ -65,6 +69,10 @@ def lane(dice: Dice) -> None:
     if rng.random() < 0.4:
         size = rng.choice((1, COUNT))
         message = m.Value({"a": np.ones(size), "_a": np.ones(size, bool), "n": np.ones((size, 2))})
+        if rng.random() < 0.5:
+            finals = np.array([None, None])
+            finals[0] = np.ones(2)
+            message = m.Value({"final_obs": finals, "final_info": {"r": 0.5}})
     frames = [bytes(frame) for frame in m.pack(spoiled_message(dice, message))]
     if rng.random() < 0.3:
         frames = dice.spoiler.frames(frames, dice.corpus)
@@ -78,9 +86,16 @@ def lane(dice: Dice) -> None:
     _put(ours.reply, slabs.INFOS, frames[0])
     _put(ours.reply, slabs.ANSWER, packet)
     _put(ours.slot, 0, packet)
-    shard.write_message(m.pack(m.Render(1)), (0, 0, 0), rng.choice((None, ours.slots)))
-    words[slabs.OUTCOME] = rng.choice((1, 2, 3, 4, 4, 0, 5, 2**64 - 1))
-    in_answer = rng.random() < 0.4
+    if steps_in_columns:
+        shard.write([np.zeros(COUNT, np.int64)], (0, 0, 0))
+    else:
+        shard.write_message(m.pack(m.Render(1)), (0, 0, 0), rng.choice((None, ours.slots)))
+    words[slabs.OUTCOME] = rng.choice((1, 2, 3, 4, 4, 0, 5, 5, 2**64 - 1))
+    words[slabs.OFFERED], words[slabs.FORM] = 0, rng.choice((0, 1, 1, 2))
+    if type(message) is m.Value and rng.random() < 0.7:
+        with suppress(IrregularError):
+            words[slabs.OFFERED] = StepColumns([message.value], slabs.INFO_BYTES).digest
+    in_answer = not steps_in_columns and rng.random() < 0.8
     length = len(packet) if in_answer else len(frames[0])
     words[slabs.LENGTH] = rng.choice((length, length, length, 0, length + 1, 2**16, 2**64 - 1))
     found = attempt(shard.answer) if in_answer else attempt(shard.outcome)

@@ -57,7 +57,7 @@ Outcome = tuple[int, m.Message | None]
 """``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and the message in the slab, if any."""
 NO_MORE: Outcome = (slabs.DONE, None)
 """The outcome of a step without infos."""
-_OUTCOMES = frozenset({slabs.DONE, slabs.RAISED, slabs.FETCH, slabs.COLUMNS})
+_OUTCOMES = frozenset({slabs.DONE, slabs.RAISED, slabs.FETCH, slabs.COLUMNS, slabs.FORMED})
 _UNKNOWN = -1
 RING = 4
 """The number of slots to lend: for the last two batches, and two that a caller keeps."""
@@ -128,10 +128,9 @@ class ShardSlabs:
         # Where the answer to it comes; None: the reply slab.
         self._answer_slots: SlotRing | None = None
         self.told_bytes = self.answer_bytes = 0
-        # Derived from the last answer that was offered.
-        self._step_columns: StepColumns | None = None
+        # Derived from the answers that were offered, by the number of the form.
+        self._forms: dict[int, StepColumns] = {}
         self._form: StepColumns | None = None  # of the last answer
-        self._checked_form: StepColumns | None = None  # a form that the manifest was compared with
         self._actions: Any = None  # the slab as the actions of a step that is a message
         self._told_frames: Frames = []  # of the last message, until its actions are noted
 
@@ -246,15 +245,21 @@ class ShardSlabs:
         An encoded message is always decoded, since it may have the schema of later columns.
         """
         kind, length = self._tells[slabs.OUTCOME], self._tells[slabs.LENGTH]
-        if kind not in _OUTCOMES or length > slabs.INFO_BYTES:
+        is_known = kind in _OUTCOMES and not (kind == slabs.FORMED and self._told)
+        if not is_known or length > slabs.INFO_BYTES:
             raise RemoteProtocolError("the worker wrote an impossible reply into its slab")
+        start = slabs.INFOS
+        if kind == slabs.FORMED:
+            form, packed = self._form_of(length), bytes(self._reply[start : start + length])
+            return slabs.DONE, m.Value(*form.read(self._reply, slabs.ANSWER, packed, to_tensor))
         if not length:
             return kind, None
-        start = slabs.INFOS
         message = unpacked([self._reply[start : start + length]])
         if isinstance(message, m.RaisedException):  # whatever kind the worker wrote
             return slabs.RAISED, message
         if isinstance(message, m.Value) and type(message.value) is dict:
+            if not self._told and self._derive([message.value], slabs.INFO_BYTES):
+                return kind, message  # the runner knows by that that the schema is still valid
             with UNTRUSTED:
                 infos, columns = message.value, columns_of(message.value) or ()
                 beside = {key: value for key, value in infos.items() if type(key) is int}
@@ -282,7 +287,7 @@ class ShardSlabs:
             return None
         area = self._answers if slots is None else slots.bytes_of_chosen()
         if kind == slabs.COLUMNS and slots is not None:
-            return m.StepDone(*self._step_of_columns(length, slots))
+            return m.StepDone(*self._step_of_columns(self._form_of(length), length, slots))
         if kind not in (slabs.DONE, slabs.RAISED) or length > len(area):
             raise RemoteProtocolError("the worker wrote an impossible answer into its slab")
         if kind == slabs.RAISED:
@@ -292,21 +297,37 @@ class ShardSlabs:
             frames = read_packet(area[:length], limits)
         borrows = slots is not None and slots.chosen != _SPARE
         message = unpacked(frames, limits=limits, borrows=borrows)
-        offered = self._tells[slabs.OFFERED]
-        if slots is not None and type(message) is m.StepDone and offered:
-            # 0 until the columns exist: after an interrupt the runner sends none that we lack
-            self._asks[slabs.DERIVED] = 0
-            with suppress(IrregularError):
-                columns = StepColumns(m.values_of(message), slots.slot_bytes, space)
-                if columns.digest == offered:  # the runner's Gymnasium may know other spaces
-                    self._form = self._step_columns = columns
-                    self._asks[slabs.DERIVED] = self._asks[slabs.SEQUENCE]
+        if slots is not None and type(message) is m.StepDone:
+            self._form = self._derive(m.values_of(message), slots.slot_bytes, space)
         return message
 
-    def _step_of_columns(self, length: int, slots: SlotRing) -> list[Any]:
-        columns = self._step_columns
+    def _derive(
+        self, values: Sequence[Any], room: int, space: gym.Space[Any] | None = None
+    ) -> StepColumns | None:
+        """Derive the columns that the runner offers with these values; None if there are none.
+        Trust: the number of the form is input from the worker.
+        """
+        offered, number = self._tells[slabs.OFFERED], self._tells[slabs.FORM]
+        if not offered or number >= slabs.FORMS:
+            return None
+        # 0 until the columns exist: after an interrupt the runner sends none that we lack
+        self._asks[slabs.DERIVED] = 0
+        with suppress(IrregularError):
+            columns = StepColumns(values, room, space)
+            if columns.digest == offered:  # the runner's Gymnasium may know other spaces
+                self._forms[number] = columns
+                self._asks[slabs.DERIVED] = self._asks[slabs.SEQUENCE]
+                return columns
+        return None
+
+    def _form_of(self, length: int) -> StepColumns:
+        """The form of an answer with so many bytes of scalars. Trust: input from the worker."""
+        columns = self._forms.get(self._tells[slabs.FORM])
         if columns is None or length > slabs.INFO_BYTES:
             raise RemoteProtocolError("the worker wrote an impossible answer into its slab")
+        return columns
+
+    def _step_of_columns(self, columns: StepColumns, length: int, slots: SlotRing) -> list[Any]:
         self._form = columns
         packed = bytes(self._reply[slabs.INFOS : slabs.INFOS + length]) if length else b""
         values = columns.read(*slots.whole, packed, to_tensor, slots.borrowed)
@@ -317,19 +338,19 @@ class ShardSlabs:
         """The fields of a step's answer, if it has columns of a form that ``note_checked`` noted;
         else None. Raises as ``answer``.
         """
-        tells, slots, columns = self._tells, self._answer_slots, self._step_columns
-        if columns is None or columns is not self._checked_form or slots is None:
+        tells, slots = self._tells, self._answer_slots
+        if tells[slabs.OUTCOME] != slabs.COLUMNS or slots is None:
             return None
-        if tells[slabs.OUTCOME] != slabs.COLUMNS:
-            return None
-        return self._step_of_columns(tells[slabs.LENGTH], slots)
+        length = tells[slabs.LENGTH]
+        columns = self._form_of(length)
+        return self._step_of_columns(columns, length, slots) if columns.checked else None
 
     def note_checked(self, restores: bool) -> None:
         """Note that the classes, dtypes and shapes of the last step's answer are as declared.
         ``restores``: as for ``Results``.
         """
         if self._form is not None and (self._form.has_classes or not restores):
-            self._checked_form = self._form
+            self._form.checked = True
 
     def prepare(self) -> None:
         """Make the arrays of infos that come as columns: see ``Copies``."""

@@ -393,6 +393,67 @@ def test_a_form_is_checked_before_it_is_trusted(asked: Asked, compared: bool) ->
     assert (trusted is not None) is compared
 
 
+@pytest.mark.parametrize(
+    ("marks", "form", "length", "refusal"),
+    [
+        ([1, 0], 1, 0, ""),
+        ([1, 1], 1, 0, ""),
+        ([2, 0], 1, 0, "neither 0 nor 1"),
+        ([1, -1], 1, 0, "neither 0 nor 1"),
+        ([], 1, 0, "fewer sizes"),
+        ([1, 0, 0], 1, 0, "other sizes"),
+        ([1, 0], 0, 0, "impossible answer"),
+        ([1, 0], 2**64 - 1, 0, "impossible answer"),
+        ([1, 0], 1, slabs.INFO_BYTES + 1, "impossible reply"),
+    ],
+)
+def test_infos_of_a_form_have_rows_where_their_marks_are(
+    shard: LaneShard, marks: list[int], form: int, length: int, refusal: str
+) -> None:
+    """Of two sub-environments; the cases without a refusal are the controls. The answer to a
+    message offers no such form, nor has it one.
+    """
+    ended = np.array([True, False])
+    finals = np.array([None, None])
+    finals[0] = np.zeros(2)
+    infos = {"final_obs": finals, "_final_obs": ended, "final_info": {"r": np.zeros(2)}}
+    offered = bytes(m.pack(m.Value(infos))[0])
+    digest = StepColumns([infos], slabs.INFO_BYTES).digest
+    numbers = [*marks, slabs.DTYPE_CODES[np.dtype(np.float64)]]
+    scalars = msgpack.packb([np.array(numbers, np.int64).tobytes(), ""])
+    told = struct.pack("QQQQ", slabs.FORMED, length or len(scalars), 0, form)
+    for wrong in ("message", "digest", ""):
+        if wrong == "message":
+            shard.write_message(m.pack(m.Render(1)), (0, 0, 0))
+        else:
+            shard.write([np.zeros((2, 2), np.float32)], (0, 0, 0))
+        told_digest = digest + (wrong == "digest")
+        words = struct.pack("QQQQ", slabs.DONE, len(offered), told_digest, 1)
+        attack(
+            shard,
+            f"os.pwrite(reply, {offered!r}, {slabs.INFOS})\n"
+            f"os.pwrite(reply, {words!r}, {slabs.OUTCOME * 8})",
+        )
+        assert shard.outcome()[0] == slabs.DONE
+        attack(
+            shard,
+            f"os.pwrite(reply, {scalars!r}, {slabs.INFOS})\n"
+            f"os.pwrite(reply, b'\x02' * {slabs.INFO_BYTES}, {slabs.ANSWER})\n"
+            f"os.pwrite(reply, {told!r}, {slabs.OUTCOME * 8})",
+        )
+        if wrong or refusal:
+            with pytest.raises(RemoteProtocolError, match="impossible" if wrong else refusal):
+                shard.outcome()
+            continue
+        _, message = shard.outcome()
+        attack(shard, f"os.pwrite(reply, bytes({slabs.INFO_BYTES}), {slabs.ANSWER})")
+        assert isinstance(message, m.Value)
+        rows, mask, _ = message.value.values()
+        assert [row is not None for row in rows] == [bool(mark) for mark in marks]
+        assert rows[0].tobytes() == b"\x02" * 16
+        assert mask.tobytes() == b"\x01\x01"
+
+
 FLAGS = spaces.Sequence(spaces.MultiBinary(2))
 WORDS = spaces.OneOf([spaces.Sequence(spaces.Text(9)), spaces.Graph(spaces.Box(-1, 1, (2,)), None)])
 PAIRS = spaces.Sequence(spaces.Tuple([spaces.MultiBinary(1)] * 2))

@@ -75,7 +75,6 @@ class Lane:
         warned: Sequence[Any],
         watches: Watches,
     ) -> None:
-        self._space = space
         self._do_step, self._complete, self._pack = step, complete, pack
         self.number = attach.env
         self.unsent: list[Any] = []
@@ -102,10 +101,8 @@ class Lane:
         # The requests that were served, and the client's wishes as they were read last.
         self._served = self._changes = self._cpu = self._spin_ns = 0
         self._step: tuple[int, Any] = 0, None  # ``WRITTEN`` of a step, and its actions in the slab
-        self._columns: tuple[int, StepColumns | None] = 0, None  # and of which step they are
-        # Results without columns in a row; bytes of the last scalars.
-        self._missed = self._scalars = 0
-        self._offers_at = 1  # misses in a row
+        self._forms = Forms(self._asked, self._told, self._slot_bytes, space)
+        self._scalars = 0  # bytes of the last ones
 
     def wake(self, *, alone: bool) -> bool:
         """Silence the doorbell and serve; if ``alone``, go on while requests come quickly. Returns
@@ -222,7 +219,8 @@ class Lane:
         values = self._complete(result)
         if values is not result and self._write_columns(values):
             return slabs.COLUMNS, self._scalars
-        self._offer(values)
+        if self._fills_slot():
+            self._forms.offer(values)
         frames = self._pack(m.StepDone(*values))
         if self._watched:
             self._watches.look()
@@ -262,29 +260,13 @@ class Lane:
 
     def _write_columns(self, values: Sequence[Any]) -> bool:
         """Write a step's results if they have the form of the columns; returns whether they do."""
-        derived, columns = self._columns
-        if columns is None or self._asked[slabs.DERIVED] != derived or not self._fills_slot():
+        if not self._fills_slot():
             return False
-        try:
-            packed = columns.write(values, self._observations, self._slot)
-        except IrregularError:
+        packed = self._forms.write(values, self._observations, self._slot)
+        if packed is None:
             return False
         self._scalars = self._put(packed) if packed else 0
-        self._missed, self._offers_at = 0, 2
         return True
-
-    def _offer(self, values: Sequence[Any]) -> None:
-        """Offer columns for such results, the more rarely the more in a row had other forms."""
-        if not self._fills_slot():
-            return
-        missed = self._missed = self._missed + 1
-        if missed >= self._offers_at:
-            self._offers_at = missed + 1 + min(missed // 8, _SELDOM)
-            with contextlib.suppress(IrregularError):
-                columns = StepColumns(values, self._slot_bytes, self._space)
-                self._columns = self._asked[slabs.SEQUENCE], columns
-                self._told[slabs.OFFERED] = columns.digest
-                self._offers_at = missed + min(missed + 1, _SELDOM)
 
     def leave_slot(self) -> None:
         """Stop writing into the slot, which the caller may hold: the next batch is a message."""
@@ -333,7 +315,8 @@ class ColumnLane(Lane):
         self._codes: list[int] = []  # dtype codes of the actions, as they were read last
         self._takes: list[Callable[[], Any]] = []  # reads one leaf each, by these codes
         self._pairs: Pairs = []  # the last step's infos, in case the client fetches them
-        self._writer = InfoWriter(self._reply, slabs.INFOS, layout.count, self._pack, env.joined)
+        self._forms = Forms(self._asked, self._told, slabs.INFO_BYTES)
+        self._writer = InfoWriter(self._reply, layout.count, self._pack, env.joined, self._forms)
         self._move(attach.start, observed)
 
     def _move(self, start: int, observed: slabs.ObservationLayout) -> None:
@@ -398,24 +381,84 @@ def _arrays_in(view: Any) -> list[Any]:
     return [view[index, ...].copy() for index in range(len(view))]
 
 
+class Forms:
+    """Writes results as columns if they have a form that the client has derived, too.
+
+    Args:
+        asked, told: The headers of the request and the reply slab.
+        room, space: As for ``StepColumns``.
+    """
+
+    def __init__(
+        self, asked: Any, told: Any, room: int, space: gym.Space[Any] | None = None
+    ) -> None:
+        self._asked, self._told, self._room, self._space = asked, told, room, space
+        self._forms: list[StepColumns | None] = [None] * slabs.FORMS
+        self._last = 0  # the number of the form that was used last
+        self._fresh, self._offered = -1, 0  # the form not used yet, and of which step it is
+        # Results of other forms since the last form was first used, and when to offer the next.
+        self._missed, self._offers_at = 0, 1
+
+    @property
+    def is_derived(self) -> bool:
+        """Whether the client has derived the columns that were offered last."""
+        return bool(self._asked[slabs.DERIVED] == self._offered)
+
+    def write(self, values: Sequence[Any], memory: Any, start: int) -> bytes | None:
+        """Write results as ``StepColumns.write``; None if they have another form."""
+        for number in (self._last, 1 - self._last):
+            columns = self._forms[number]
+            if columns is None or (number == self._fresh and not self.is_derived):
+                continue
+            try:
+                packed = columns.write(values, memory, start)
+            except IrregularError:
+                continue
+            self._told[slabs.FORM] = self._last = number
+            if number == self._fresh:
+                self._fresh, self._missed, self._offers_at = -1, 0, 1
+            return packed
+        return None
+
+    def offer(self, values: Sequence[Any]) -> bool:
+        """Offer columns for such results in place of the form that was not used last, the more
+        rarely the more offers were of no use; returns whether it did.
+        """
+        missed = self._missed = self._missed + 1
+        if missed < self._offers_at:
+            return False
+        self._offers_at = missed + 1 + min(missed // 8, _SELDOM)
+        try:
+            columns = StepColumns(values, self._room, self._space)
+        except IrregularError:
+            return False
+        self._fresh, self._offered = 1 - self._last, self._asked[slabs.SEQUENCE]
+        self._forms[self._fresh] = columns
+        self._told[slabs.FORM], self._told[slabs.OFFERED] = self._fresh, columns.digest
+        self._offers_at = missed + min(missed + 1, _SELDOM)
+        return True
+
+
 class InfoWriter:
-    """Writes infos into a slab: as columns while their schema stays the same, else encoded.
-    ``start``: offset of the slab's info area; ``joined``: joins the pairs of infos.
+    """Writes infos into a slab: as columns while their schema or form stays the same, else encoded.
+    ``joined``: joins the pairs of infos; ``forms``: the forms of infos that are not flat.
     """
 
     def __init__(
         self,
         reply: Any,
-        start: int,
         count: int,
         pack: Callable[[m.Message], list[Any]],
         joined: Callable[[Pairs], dict[Any, Any]],
+        forms: Forms,
     ) -> None:
         self._reply = reply
-        self._start = start
         self._count = count
         self._pack = pack
         self._joined = joined
+        self._forms = forms
+        self._told = slabs.words(reply)
+        self._offers = False  # whether a form was offered last, with which the client keeps columns
         self._integers: Sequence[bool] = ()
         # The schema that the client knows too: keys and classes of each info, and what writes the
         # values of all, key by key. None: the next infos go encoded.
@@ -431,21 +474,31 @@ class InfoWriter:
         ``encoded``: whether infos hold a value that fits no column, such as a reward that is no
         number.
         """
+        if self._offers and not self._forms.is_derived:
+            self._keys = None
+        self._offers = False
         unchanged = self._keys is not None and integers == self._integers and not encoded
         if unchanged and self._write_columns(pairs):
             return slabs.COLUMNS, 0
         infos = self._joined(pairs)
+        packed = self._forms.write([infos], self._reply, slabs.ANSWER)
+        if packed is not None:
+            return slabs.FORMED, self.put(packed)
         frames = self._pack(m.Value(infos))
         if len(frames) > 1 or memoryview(frames[0]).nbytes > slabs.INFO_BYTES:
             return slabs.FETCH, 0
-        self._learn(pairs, infos)
-        self._integers = integers
+        self._told[slabs.OFFERED] = 0
+        if self._learn(pairs, infos):
+            self._integers = integers
+        else:
+            self._offers = self._forms.offer([infos])
+            self._keys = self._keys if self._offers else None
         return slabs.DONE, self.put(frames[0])
 
     def put(self, frame: Any) -> int:
         """Write encoded bytes; returns their number."""
         size = memoryview(frame).nbytes
-        self._reply[self._start : self._start + size] = frame
+        self._reply[slabs.INFOS : slabs.INFOS + size] = frame
         return size
 
     def _write_columns(self, pairs: Pairs) -> bool:
@@ -458,16 +511,15 @@ class InfoWriter:
                 return False
             rows.append(values)
         try:
-            self._write_values(self._reply, self._start, *chain(*zip(*rows, strict=True)))
+            self._write_values(self._reply, slabs.INFOS, *chain(*zip(*rows, strict=True)))
         except (OverflowError, struct.error):  # an integer beyond 64 bit: joining fails of it, or
             return False  # it goes encoded
         return True
 
-    def _learn(self, pairs: Pairs, infos: dict[Any, Any]) -> None:
-        """Learn columns for scalars that every sub-environment has. The client does not read their
-        masks, which are all true.
+    def _learn(self, pairs: Pairs, infos: dict[Any, Any]) -> bool:
+        """Learn columns for scalars that every sub-environment has; returns whether they are such.
+        The client does not read their masks, which are all true.
         """
-        self._keys = None
         columns = slabs.columns_of(infos)
         first = pairs[0][1] if pairs else {}
         types = list(map(type, first.values()))
@@ -477,16 +529,17 @@ class InfoWriter:
             or [column.key for column in columns] != [*chain(*((key, f"_{key}") for key in first))]
             or not all(map(batches.is_scalar, types))
         ):
-            return
+            return False
         form, end = "", 0
         for column in columns[::2]:
             form += f"{column.offset - end}x{self._count}{column.dtype.char}"
             end = column.offset + self._count * column.dtype.itemsize
-        rows = [column.view(self._reply, self._start) for column in columns[::2]]
+        rows = [column.view(self._reply, slabs.INFOS) for column in columns[::2]]
         # ``struct`` has numpy's codes, but changes the bits of a NaN in fewer than 64
         exact = {"e", "f"}.isdisjoint(form)
         self._write_values = struct.Struct(form).pack_into if exact else partial(_write_rows, rows)
         self._keys, self._types = list(first), types
+        return True
 
 
 def _write_rows(rows: Sequence[Any], _: Any, start: int, *values: Any) -> None:

@@ -6,7 +6,8 @@ texts are written. No offset, class or key comes from the jail in between.
 
 Arrays, and bits of tensors, have a place each in the slot of the observation slab. Scalars are a
 list in msgpack, in the reply slab's area of infos. Members of a space whose sizes vary have sizes
-among the scalars, and arrays behind the others (``ragged``).
+among the scalars, and arrays behind the others (``ragged``); so have arrays of objects
+(``final_obs``), which mark where they have None.
 """
 
 from __future__ import annotations
@@ -55,12 +56,14 @@ class StepColumns:
     Attributes:
         nbytes: Bytes of a slot that the arrays of fixed sizes take.
         read_bytes: Bytes of the slot that the last ``read`` has read.
+        checked: Whether the client has compared the form with what was declared.
         digest: Differs if the peer derives other columns; not 0.
         has_classes: Whether members have the classes that Gymnasium gives them (``GraphInstance``).
 
     Raises:
         IrregularError: The values are not only numbers, texts, arrays of numbers, tensors, None and
-            bytes, in tuples, lists and dicts with text keys; or are too many, or too large.
+            bytes, in tuples, lists, dicts with text keys and arrays of objects of one form; or are
+            too many, or too large.
     """
 
     def __init__(
@@ -73,7 +76,7 @@ class StepColumns:
         self.nbytes, self._room, self._parts = 0, room, 0
         self._copies: dict[int, list[ragged.Copy]] = {}  # by the slot's start; for reading
         self._views: dict[int, list[Any]] = {}  # likewise, for writing
-        self.has_classes = True
+        self.has_classes, self.checked = True, False
         self._varies = False  # whether it has members of varying sizes
         # Where ``read`` finds arrays of varying sizes; None afterwards, as it refers to the slot.
         self._area: Any = None
@@ -110,7 +113,9 @@ class StepColumns:
             self.has_classes = False
         return self._part(value)
 
-    def _varying(self, write: ragged.Write, read: ragged.Read, count: int) -> tuple[_Take, _Make]:
+    def _varying(
+        self, write: ragged.Write, read: ragged.Read, count: int
+    ) -> tuple[Callable[[Any, New], None], Callable[[Iterator[Any], Iterator[Any]], Any]]:
         self._scalars += [bytes, str]
         self._varies = True
 
@@ -124,6 +129,18 @@ class StepColumns:
             return ragged.read_members(read, count, received)
 
         return take, make
+
+    def _objects(self, value: Any) -> tuple[_Take, _Make]:
+        known = next((member for member in value if member is not None), None)
+        count = len(value)
+        take, make = self._varying(*ragged.members_like(known), count)
+
+        def take_objects(value: Any, new: New) -> None:
+            if type(value) is not np.ndarray or value.dtype != object:
+                raise IrregularError
+            take(tuple(value.tolist()), new)
+
+        return take_objects, lambda *columns: np.fromiter(make(*columns), object, count)
 
     def _part(self, value: Any) -> tuple[_Take, _Make]:
         self._parts += 1
@@ -154,6 +171,8 @@ class StepColumns:
         name, array = "", value
         if isinstance(value, np.generic) and value.dtype in arrays.NUMBERS:
             return self._scalar(type(value), type(value.item()), item=True)
+        if type(value) is np.ndarray and value.dtype == object and value.ndim == 1:
+            return self._objects(value)
         if type(value) is _tensor_type():
             name, array = arrays.tensor_bits(value)
         # without torch bfloat16 arrives as another dtype

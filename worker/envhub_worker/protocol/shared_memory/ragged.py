@@ -191,6 +191,38 @@ def members_of(space: Any, *, stacked: bool = False) -> tuple[Write, Read]:
     raise IrregularError
 
 
+def members_like(value: Any) -> tuple[Write, Read]:
+    """Makes what writes and reads members of the form of this one, or None in their place.
+    Raises ``IrregularError``: they may have other sizes, or it is of another class.
+    """
+    write, read = _form_of(value)
+
+    def write_some(members: Sequence[Any], written: Written) -> None:
+        written.numbers += [member is not None for member in members]
+        write([member for member in members if member is not None], written)
+
+    def read_some(count: int, received: Received) -> list[Any]:
+        marks = received.numbers(count)
+        if not {0, 1}.issuperset(marks):
+            raise RemoteProtocolError("the worker wrote a mark that is neither 0 nor 1")
+        members = iter(read(sum(marks), received))
+        return [next(members) if mark else None for mark in marks]
+
+    return write_some, read_some
+
+
+def _form_of(value: Any) -> tuple[Write, Read]:
+    if type(value) is np.ndarray and value.ndim:
+        return _rows(value.shape)
+    if type(value) is int or isinstance(value, np.integer):
+        return _write_integers, _read_integers
+    if type(value) is str:
+        return _write_texts, _read_texts
+    if type(value) is dict and _classes([*value]) == {str}:
+        return _fields(list(map(_form_of, value.values())), {dict}, keys=list(value))
+    raise IrregularError
+
+
 def _is_one_of(space: Any) -> bool:
     return OneOf is not None and isinstance(space, OneOf)
 

@@ -19,12 +19,16 @@ SEQUENCE = 0
 PARKED = 8
 """1 while this slab's writer sleeps in poll and wants its doorbell rung."""
 OUTCOME = 16
-"""Reply: ``DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``."""
+"""Reply: ``DONE``, ``RAISED``, ``FETCH``, ``COLUMNS`` or ``FORMED``."""
 LENGTH = 17
 """Reply: bytes of the encoded infos, or of what was raised; 0 for an empty info. Where a step is a
-message: of the answer, or of its scalars if it is columns."""
+message: of the answer, or of its scalars if it is columns. If ``FORMED``: of the infos' scalars."""
 OFFERED = 18
 """Reply: the ``digest`` of the columns that the client should derive from this answer, or 0."""
+FORM = 19
+"""Reply: which of ``FORMS`` forms the offered columns or the results have."""
+FORMS = 2
+"""Forms that are kept: that of most steps, and that of steps which end an episode."""
 SPIN = 16
 """Request: nanoseconds that the shard may wait for the next request without sleeping."""
 SLOT = 17
@@ -55,10 +59,10 @@ HEADER_BYTES = HEADER_WORDS * 8
 
 AVOIDED = 1 << 32
 
-DONE, RAISED, FETCH, COLUMNS = 1, 2, 3, 4
+DONE, RAISED, FETCH, COLUMNS, FORMED = 1, 2, 3, 4, 5
 """Results and encoded infos are in the slab; an encoded ``RaisedException`` is; the infos must be
 fetched; the infos are columns (see ``slabs``), or all results of a step that is a message are (see
-``columns``)."""
+``columns``); the infos are such columns as those, in the area of answers."""
 
 INFOS = HEADER_BYTES
 """Offset of the encoded infos in a reply slab."""
