@@ -120,9 +120,11 @@ class Prewarm:
                 self.unused = False
                 # interruption.md, rule 1: the state moves first, so a reset starts another jail
                 self.lifecycle.moved(Event.EXPIRY)
-                self._lease.close_politely()
-                self._lease.give_back()
-                self.lifecycle.moved(Event.FORGET)
+                try:
+                    self._lease.close_politely()
+                finally:  # a filter of the caller may raise its warnings
+                    self._lease.give_back()
+                    self.lifecycle.moved(Event.FORGET)
             return True
         finally:
             lock.release()

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError, WorkerError
 from envhub_sandbox.sandboxes.pool import stop_idle
 from envhub_sandbox.sandboxes.process import PROCESS
+from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.system.folders import cache_root
 from tests.support import inside
 from tests.support.processes import descendants, eventually
@@ -147,16 +149,24 @@ def test_by_default_who_closes_each_task_finds_the_next_one_up(
         assert settled(envs, [index + 1] if closes else [])
 
 
-@pytest.mark.parametrize("count", [1, 3])
-def test_no_more_are_up_unused_than_was_said(tasks: Callable[..., Tasks], count: int) -> None:
-    """Whichever task is used next; what is not among the following is given up, and can return."""
+@pytest.mark.parametrize(("count", "warns"), [(1, False), (3, False), (3, True)])
+def test_no_more_are_up_unused_than_was_said(
+    tasks: Callable[..., Tasks], monkeypatch: pytest.MonkeyPatch, count: int, warns: bool
+) -> None:
+    """Whichever task is used next; what is not among the following is given up, and can return.
+    So can what warns as it is closed, where a filter makes errors of warnings."""
     envs = tasks(8, policy={"prewarm": count})
+    if warns:
+        closing = Mock(side_effect=RuntimeWarning)
+        monkeypatch.setattr(Lease, "close_politely", closing)
     used: set[int] = set()
     for index in (0, 4, 1):
         assert envs[index].reset()[0][0][0] == index
         used.add(index)
         following = [at for at in range(index + 1, 8) if at not in used]
         assert settled(envs, following[:count]), (index, states(envs))
+    assert set(states(envs)) == {"READY", "IDLE"}
+    monkeypatch.undo()
 
 
 def test_one_task_outlives_the_suite_that_it_came_from(repository: Path) -> None:
