@@ -149,16 +149,20 @@ def test_a_small_payload_travels_in_the_frame_of_the_header() -> None:
         assert m.unpack_with_id(frames) == (REQUEST_ID, message, apart)
 
 
-@pytest.mark.parametrize(("start", "more"), [(8, []), (11, []), (12, []), (20, []), (None, [b"x"])])
-def test_a_joined_frame_that_is_cut_off_or_not_alone_is_refused(
-    start: int | None, more: list[bytes]
+@pytest.mark.parametrize(
+    ("start", "end", "more"),
+    [*((cut, b"", []) for cut in (8, 11, 12, 20)), (None, b"", [b"x"]), (None, bytes(8190), [])],
+)
+def test_a_joined_frame_that_is_cut_off_too_large_or_not_alone_is_refused(
+    start: int | None, end: bytes, more: list[bytes]
 ) -> None:
     [frame] = m.with_id(m.pack(m.RelayDone((1,)))[0], REQUEST_ID, [bytes(2)])
     assert len(frame) > 20
-    cut = bytes(frame)[:start]
-    assert m.id_of(cut) == REQUEST_ID, "its sender gets the refusal"
+    assert m.unpack_with_id([frame + end[1:]])[0] == REQUEST_ID
+    changed = bytes(frame)[:start] + end
+    assert m.id_of(changed) == REQUEST_ID, "its sender gets the refusal"
     with pytest.raises(RemoteProtocolError):
-        m.unpack_with_id([cut, *more])
+        m.unpack_with_id([changed, *more])
 
 
 @pytest.mark.parametrize("number", [1, 148 + 25 * 256, 2**63 - 1])

@@ -224,12 +224,15 @@ def unpack_with_id(
     number = id_of(first)
     if number is None:
         raise RemoteProtocolError("the header does not start with the id of a request")
-    header = without_id(first)
     if first[0] & 0x80:  # ``_JOINED``
-        if payload or len(header) < DOCUMENT_BYTES.size:
+        end = _NUMBER.size + DOCUMENT_BYTES.size
+        if payload or len(first) < end:
             raise RemoteProtocolError("a frame is not the only one of its message, or too short")
-        end = DOCUMENT_BYTES.size + DOCUMENT_BYTES.unpack_from(header)[0]
-        header, payload = header[:end], [header[end:]]
+        end += DOCUMENT_BYTES.unpack_from(first, _NUMBER.size)[0]
+        if len(first) - end >= _JOINED_BYTES:  # before it is copied
+            raise RemoteProtocolError("a frame that joins its header is too large for that")
+        first, payload = first[:end], [first[end:]]
+    header = without_id(first)
     form = _INCOMING.get(header) if type(header) is bytes else None
     if form is not None and form.limits is limits:  # as unpack, which a step need not call
         return number, form.message(), payload
