@@ -258,8 +258,8 @@ class ShardSlabs:
         if isinstance(message, m.RaisedException):  # whatever kind the worker wrote
             return slabs.RAISED, message
         if isinstance(message, m.Value) and type(message.value) is dict:
-            if not self._told and self._derive([message.value], slabs.INFO_BYTES):
-                return kind, message  # the runner knows by that that the schema is still valid
+            if not self._told:
+                self._derive([message.value], slabs.INFO_BYTES)
             with UNTRUSTED:
                 infos, columns = message.value, columns_of(message.value) or ()
                 beside = {key: value for key, value in infos.items() if type(key) is int}

@@ -399,44 +399,36 @@ class Forms:
         # Results of other forms since the last form was first used, and when to offer the next.
         self._missed, self._offers_at = 0, 1
 
-    @property
-    def is_derived(self) -> bool:
-        """Whether the client has derived the columns that were offered last."""
-        return bool(self._asked[slabs.DERIVED] == self._offered)
-
     def write(self, values: Sequence[Any], memory: Any, start: int) -> bytes | None:
         """Write results as ``StepColumns.write``; None if they have another form."""
         for number in (self._last, 1 - self._last):
             columns = self._forms[number]
-            if columns is None or (number == self._fresh and not self.is_derived):
+            is_new = number == self._fresh
+            if columns is None or (is_new and self._asked[slabs.DERIVED] != self._offered):
                 continue
             try:
                 packed = columns.write(values, memory, start)
             except IrregularError:
                 continue
             self._told[slabs.FORM] = self._last = number
-            if number == self._fresh:
+            if is_new:
                 self._fresh, self._missed, self._offers_at = -1, 0, 1
             return packed
         return None
 
-    def offer(self, values: Sequence[Any]) -> bool:
+    def offer(self, values: Sequence[Any]) -> None:
         """Offer columns for such results in place of the form that was not used last, the more
-        rarely the more offers were of no use; returns whether it did.
+        rarely the more offers were of no use.
         """
         missed = self._missed = self._missed + 1
-        if missed < self._offers_at:
-            return False
-        self._offers_at = missed + 1 + min(missed // 8, _SELDOM)
-        try:
-            columns = StepColumns(values, self._room, self._space)
-        except IrregularError:
-            return False
-        self._fresh, self._offered = 1 - self._last, self._asked[slabs.SEQUENCE]
-        self._forms[self._fresh] = columns
-        self._told[slabs.FORM], self._told[slabs.OFFERED] = self._fresh, columns.digest
-        self._offers_at = missed + min(missed + 1, _SELDOM)
-        return True
+        if missed >= self._offers_at:
+            self._offers_at = missed + 1 + min(missed // 8, _SELDOM)
+            with contextlib.suppress(IrregularError):
+                columns = StepColumns(values, self._room, self._space)
+                self._fresh, self._offered = 1 - self._last, self._asked[slabs.SEQUENCE]
+                self._forms[self._fresh] = columns
+                self._told[slabs.FORM], self._told[slabs.OFFERED] = self._fresh, columns.digest
+                self._offers_at = missed + min(missed + 1, _SELDOM)
 
 
 class InfoWriter:
@@ -458,7 +450,6 @@ class InfoWriter:
         self._joined = joined
         self._forms = forms
         self._told = slabs.words(reply)
-        self._offers = False  # whether a form was offered last, with which the client keeps columns
         self._integers: Sequence[bool] = ()
         # The schema that the client knows too: keys and classes of each info, and what writes the
         # values of all, key by key. None: the next infos go encoded.
@@ -474,9 +465,6 @@ class InfoWriter:
         ``encoded``: whether infos hold a value that fits no column, such as a reward that is no
         number.
         """
-        if self._offers and not self._forms.is_derived:
-            self._keys = None
-        self._offers = False
         unchanged = self._keys is not None and integers == self._integers and not encoded
         if unchanged and self._write_columns(pairs):
             return slabs.COLUMNS, 0
@@ -488,11 +476,10 @@ class InfoWriter:
         if len(frames) > 1 or memoryview(frames[0]).nbytes > slabs.INFO_BYTES:
             return slabs.FETCH, 0
         self._told[slabs.OFFERED] = 0
-        if self._learn(pairs, infos):
-            self._integers = integers
-        else:
-            self._offers = self._forms.offer([infos])
-            self._keys = self._keys if self._offers else None
+        self._learn(pairs, infos)
+        if self._keys is None:
+            self._forms.offer([infos])
+        self._integers = integers
         return slabs.DONE, self.put(frames[0])
 
     def put(self, frame: Any) -> int:
@@ -516,10 +503,11 @@ class InfoWriter:
             return False  # it goes encoded
         return True
 
-    def _learn(self, pairs: Pairs, infos: dict[Any, Any]) -> bool:
-        """Learn columns for scalars that every sub-environment has; returns whether they are such.
-        The client does not read their masks, which are all true.
+    def _learn(self, pairs: Pairs, infos: dict[Any, Any]) -> None:
+        """Learn columns for scalars that every sub-environment has. The client does not read their
+        masks, which are all true.
         """
+        self._keys = None
         columns = slabs.columns_of(infos)
         first = pairs[0][1] if pairs else {}
         types = list(map(type, first.values()))
@@ -529,7 +517,7 @@ class InfoWriter:
             or [column.key for column in columns] != [*chain(*((key, f"_{key}") for key in first))]
             or not all(map(batches.is_scalar, types))
         ):
-            return False
+            return
         form, end = "", 0
         for column in columns[::2]:
             form += f"{column.offset - end}x{self._count}{column.dtype.char}"
@@ -539,7 +527,6 @@ class InfoWriter:
         exact = {"e", "f"}.isdisjoint(form)
         self._write_values = struct.Struct(form).pack_into if exact else partial(_write_rows, rows)
         self._keys, self._types = list(first), types
-        return True
 
 
 def _write_rows(rows: Sequence[Any], _: Any, start: int, *values: Any) -> None:

@@ -113,9 +113,7 @@ class StepColumns:
             self.has_classes = False
         return self._part(value)
 
-    def _varying(
-        self, write: ragged.Write, read: ragged.Read, count: int
-    ) -> tuple[Callable[[Any, New], None], Callable[[Iterator[Any], Iterator[Any]], Any]]:
+    def _varying(self, write: ragged.Write, read: ragged.Read, count: int) -> tuple[Any, Any]:
         self._scalars += [bytes, str]
         self._varies = True
 
