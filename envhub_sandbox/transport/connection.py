@@ -300,7 +300,7 @@ class WorkerConnection:
 
         It may have been read before the interrupt. Raises as ``receive`` does.
         """
-        if self._latest:
+        if self._latest and m.number_of(self._latest) != 0:  # 0: compressed, so it has a payload
             reply_id, reply = m.unpack_header(self._latest, limits=self._limits)
             if reply_id == request_id:
                 return reply

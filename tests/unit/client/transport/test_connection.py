@@ -154,6 +154,17 @@ def test_what_is_no_reply_is_raised_where_it_is_received() -> None:
             connection.receive(sent, Deadline(0))
 
 
+def test_a_reply_is_looked_for_again_after_a_compressed_one() -> None:
+    """Where a wait was interrupted; the last reply that was read is another one."""
+    compressed = m.pack_header(m.CompressionHeader("lz4", ()), 0)
+    with connected() as (server, connection):
+        server.lies[m.CheckJail] = lambda asked: [compressed]
+        with pytest.raises(RemoteProtocolError):  # none was agreed on
+            connection.request(m.CheckJail(1, ""), deadline=Deadline(60))
+        sent = connection.send(m.GetStatus())
+        assert connection.reply_again(sent, Deadline(60)) == m.Status(())
+
+
 def test_an_interrupt_in_a_look_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
     """The reply may be lost then; after any other look nothing is."""
 
