@@ -7,11 +7,9 @@ from typing import Any
 
 import pytest
 
-from tests.attacks.harness import Arena
 from tests.corpus.entries import Entry
 from tests.support.command_line import envhub
 
-FAMILY = "Results and values"
 _HEAD = "import ctypes, os, random, sys, time\n"
 _FAULTS = """
 def reset(self, *, seed=None, options=None):
@@ -59,9 +57,7 @@ _SEEN = {
 
 
 @pytest.mark.parametrize("answers", _SEEN)
-def test_what_is_seen_from_outside_cannot_be_forged(
-    strict: Arena, answers: str, tmp_path: Path
-) -> None:
+def test_what_is_seen_from_outside_cannot_be_forged(answers: str, tmp_path: Path) -> None:
     """Nor that it fails; the honest runner is the control."""
     code, seen = _SEEN[answers]
     files = {"other.pyc": b"compiled"}
