@@ -12,8 +12,8 @@ _FLOCK = "flock takes no more than a descriptor; programs need it on their own f
 
 # attack: {a profile, or a condition of the host: why}
 NOT_STOPPED: dict[str, dict[str, str]] = {
-    "learn that a file exists, and its size": {
-        "no-userns": "Landlock does not restrict stat; hiding names takes a mount namespace"
+    "learn that a file exists, its size, and where a link leads": {
+        "no-userns": "Landlock restricts neither; hiding names takes a mount namespace"
     },
     "hold a readable file: flock": {"strict": _FLOCK, "no-userns": _FLOCK},
     "use up the user's descriptors in flight": {

@@ -76,11 +76,12 @@ def test_folders_cannot_be_listed(jail: OpenJail, home: Path) -> None:
 def test_files_cannot_be_probed_for(jail: OpenJail, home: Path) -> None:
     size = 100_000 + int(token()[:4], 16)
     (home / "model.bin").write_bytes(b"x" * size)
+    (home / "latest").symlink_to(home / "model.bin")
     jail.attack(
-        "learn that a file exists, and its size",
-        "stat_file",
-        lambda run: run.value == size,
-        path=str(home / "model.bin"),
+        "learn that a file exists, its size, and where a link leads",
+        "stat_link",
+        lambda run: run.value == [size, str(home / "model.bin")],
+        path=str(home / "latest"),
     )
 
 

@@ -27,9 +27,9 @@ def list_folder(path):
     return os.listdir(path)
 
 
-def stat_file(path):
-    """Learn that a file exists, and its size, without opening it."""
-    return os.stat(path).st_size
+def stat_link(path):
+    """Learn that a file exists, its size, and where its link leads, without opening it."""
+    return [os.stat(path).st_size, os.readlink(path)]
 
 
 def read_through_symlink(path):
