@@ -1,5 +1,6 @@
 """From policy and host to layers, by exact output."""
 
+import errno
 import resource
 from dataclasses import replace
 from types import SimpleNamespace
@@ -221,10 +222,12 @@ def test_rlimits_follow_the_limits() -> None:
         ),
         ({"/.dockerenv": ""}, "container's seccomp profile", 'profile "container"'),
         ({}, "EPERM", "administrator"),
+        ({}, "limit on processes", "ulimit -u"),
     ],
 )
 def test_refused_user_namespace_is_explained(files: dict[str, str], reason: str, fix: str) -> None:
-    error = user_namespace_unavailable(PermissionError(1, "no"), files.get)
+    number = errno.EAGAIN if "ulimit" in fix else errno.EPERM
+    error = user_namespace_unavailable(OSError(number, "no"), files.get)
     assert error.layer == "user-namespace"
     assert reason in error.reason
     assert fix in error.fix

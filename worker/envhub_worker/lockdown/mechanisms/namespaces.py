@@ -158,6 +158,9 @@ def _diagnosis(error: OSError, read: Callable[[str], str | None]) -> tuple[str, 
             "Install the AppArmor profile that `envhub doctor` prints, or run: "
             "sudo sysctl kernel.apparmor_restrict_unprivileged_userns=0.",
         )
+    if error.errno == errno.EAGAIN:
+        limits = "ulimit -u; of a service TasksMax=; of a container its pids"
+        return "a limit on processes and threads is reached", f"Raise it ({limits})."
     # ENOSPC also means that there are too many namespaces already.
     short, _, cure = shortage(error, "here").partition(": ")
     if short and error.errno != errno.ENOSPC:
