@@ -162,7 +162,7 @@ _TRIAL = 16
 """Steps of one trial."""
 _FIRST_INTERVAL = 64
 _LONGEST_INTERVAL = 8192
-_MAX_BUDGET_NS = 400_000
+_MAX_BUDGET_NS = 1_500_000
 """The longest wait awake; for later replies sleep costs little in comparison."""
 _MIN_BUDGET_NS = 100_000
 _MISSES = 3
@@ -173,11 +173,12 @@ _ADVANTAGE = 0.97
 
 class SpinChooser:
     """Chooses between spinning and sleep. The lane calls ``measured`` once for each step.
+    ``longest_ns``: the longest wait awake that it may choose.
     ``budget_ns``: how long each side may wait awake; 0 for not at all.
     """
 
-    def __init__(self, allowed: bool) -> None:
-        self.budget_ns = 0
+    def __init__(self, allowed: bool, longest_ns: int = _MAX_BUDGET_NS) -> None:
+        self.budget_ns, self._longest_ns = 0, longest_ns
         self._chosen = self._spinning = False
         self._best = {False: 0, True: 0}  # the median time of a step, asleep and awake
         self._samples: list[int] = []  # of the running trial
@@ -227,8 +228,8 @@ class SpinChooser:
         self._left = steps
         self._misses = 0
         # a reply that takes much longer than awake ones usually do will not come soon
-        usual = 3 * self._best[True] or _MAX_BUDGET_NS
-        self.budget_ns = min(max(usual, _MIN_BUDGET_NS), _MAX_BUDGET_NS) if spinning else 0
+        usual = 3 * self._best[True] or self._longest_ns
+        self.budget_ns = min(max(usual, _MIN_BUDGET_NS), self._longest_ns) if spinning else 0
 
 
 _ANY = [0]

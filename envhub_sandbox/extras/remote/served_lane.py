@@ -52,7 +52,7 @@ class ServedLane(ColumnSteps):
         self.shards = shards
         batch = ReceivedBatch(relay.declared.manifest.single_observation_space, shards)
         super().__init__(shards[0].layout, batch, relay)
-        self._spin = SpinChooser(True)
+        self._spin = SpinChooser(True, slabs.MAX_SPIN_NS)
         # Whether the present steps are messages; whether the next ones shall be, since a caller has
         # several in flight; whether the last step went through the slabs.
         self._by_message = self._more_wanted = self._by_slabs = False

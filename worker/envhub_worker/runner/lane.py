@@ -272,7 +272,7 @@ class Lane:
         """Stop writing into the slot, which the caller may hold: the next batch is a message."""
 
     def _change(self) -> None:
-        self._spin_ns = self._asked[slabs.SPIN]
+        self._spin_ns = min(self._asked[slabs.SPIN], slabs.MAX_SPIN_NS)
         if self._asked[slabs.CPU] != self._cpu:
             self._cpu = self._asked[slabs.CPU]
             avoided, core = divmod(self._cpu, slabs.AVOIDED)

@@ -39,7 +39,6 @@ _SPIN_AT = words.SPIN * _WORD.size - words.OWN_BYTES
 _KNOWN_AT = words.KNOWN * _WORD.size - words.OWN_BYTES
 _CHUNK_BYTES = 1 << 19
 """One frame of a large observation: while one is encrypted, the one before it is decrypted."""
-_MAX_SPIN_NS = 400_000
 _TURN_NS = 20_000
 """How long the server polls the slabs before it does anything else."""
 _RECHECK_MS = 2
@@ -103,7 +102,7 @@ class ServedSlabs:
         start = words.HEADER_BYTES
         self._request[start : start + len(frame) - cut] = frame[cut:]
         self._known = min(_WORD.unpack_from(frame, _KNOWN_AT)[0], words.INFO_BYTES)
-        spin_ns = min(_WORD.unpack_from(frame, _SPIN_AT)[0], _MAX_SPIN_NS)
+        spin_ns = min(_WORD.unpack_from(frame, _SPIN_AT)[0], words.MAX_SPIN_NS)
         if not _MAY_SPIN:
             asks[words.SPIN] = spin_ns = 0
         self.awake_until = perf_counter_ns() + spin_ns if spin_ns else 0

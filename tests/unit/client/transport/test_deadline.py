@@ -48,6 +48,9 @@ def test_waits_in_vain_end_spinning_at_once() -> None:
     chooser = SpinChooser(True)
     run(chooser, 10_000, awake_ns=50_000, asleep_ns=90_000)
     assert chooser.budget_ns == 150_000
+    limited = SpinChooser(True, longest_ns=120_000)
+    run(limited, 10_000, awake_ns=50_000, asleep_ns=90_000)
+    assert limited.budget_ns == 120_000
     for _ in range(3):
         chooser.missed()
         chooser.measured(1_000_000)

@@ -30,7 +30,10 @@ FORM = 19
 FORMS = 2
 """Forms that are kept: that of most steps, and that of steps which end an episode."""
 SPIN = 16
-"""Request: nanoseconds that the shard may wait for the next request without sleeping."""
+"""Request: nanoseconds that the shard may wait for the next request without sleeping; of more
+than ``MAX_SPIN_NS`` it takes so many."""
+MAX_SPIN_NS = 400_000
+"""The client may use the time between two requests, and the core, for other work."""
 SLOT = 17
 """Request: the slot of the observation slab that the shard writes."""
 CPU = 18
