@@ -139,6 +139,14 @@ def test_other_members_of_an_array_of_objects_have_no_form(value: Any) -> None:
         StepColumns([objects], 4096).write([objects], bytearray(4096), 0)
 
 
+@pytest.mark.parametrize(("member", "shape"), [(None, ()), ((None, "a"), ()), ("a", (2, 2))])
+def test_arrays_of_objects_of_another_shape_have_no_form(member: Any, shape: Any) -> None:
+    columns, others = StepColumns([np.array([None, "a"])], 4096), np.empty(shape, object)
+    others.fill(member)
+    with pytest.raises(IrregularError):
+        columns.write([others], bytearray(4096), 0)
+
+
 def test_the_same_small_dict_goes_as_columns() -> None:
     slab = Slab(2)
     for step in range(5):

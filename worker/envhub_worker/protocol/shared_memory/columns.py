@@ -134,7 +134,7 @@ class StepColumns:
         take, make = self._varying(*ragged.members_like(known), count)
 
         def take_objects(value: Any, new: New) -> None:
-            if type(value) is not np.ndarray or value.dtype != object:
+            if type(value) is not np.ndarray or value.dtype != object or value.shape != (count,):
                 raise IrregularError
             take(tuple(value.tolist()), new)
 
