@@ -129,7 +129,10 @@ def test_infos_of_ends_have_forms_beside_the_columns(served: bool) -> None:
         assert slab.outcomes[-6:] == [*last] * 3
 
 
-@pytest.mark.parametrize("value", [{}, {1: "a"}, 0.5, np.array(1), np.array([b"a"])])
+_MANY = dict.fromkeys(map(str, range(1024)), 1)
+
+
+@pytest.mark.parametrize("value", [{}, {1: "a"}, 0.5, np.array(1), np.array([b"a"]), _MANY])
 def test_other_members_of_an_array_of_objects_have_no_form(value: Any) -> None:
     objects = np.array([None, None])
     with pytest.raises(IrregularError):

@@ -131,7 +131,7 @@ class StepColumns:
     def _objects(self, value: Any) -> tuple[_Take, _Make]:
         known = next((member for member in value if member is not None), None)
         count = len(value)
-        take, make = self._varying(*ragged.members_like(known), count)
+        take, make = self._varying(*ragged.members_like(known, self._count_part), count)
 
         def take_objects(value: Any, new: New) -> None:
             if type(value) is not np.ndarray or value.dtype != object or value.shape != (count,):
@@ -140,10 +140,13 @@ class StepColumns:
 
         return take_objects, lambda *columns: np.fromiter(make(*columns), object, count)
 
-    def _part(self, value: Any) -> tuple[_Take, _Make]:
+    def _count_part(self) -> None:
         self._parts += 1
         if self._parts > _MAX_PARTS:
             raise IrregularError
+
+    def _part(self, value: Any) -> tuple[_Take, _Make]:
+        self._count_part()
         kind = type(value)
         if kind in _PLAIN:
             return self._scalar(kind, kind, item=False)

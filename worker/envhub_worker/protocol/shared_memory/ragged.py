@@ -191,11 +191,12 @@ def members_of(space: Any, *, stacked: bool = False) -> tuple[Write, Read]:
     raise IrregularError
 
 
-def members_like(value: Any) -> tuple[Write, Read]:
+def members_like(value: Any, count_part: Callable[[], None]) -> tuple[Write, Read]:
     """Makes what writes and reads members of the form of this one, or None in their place.
+    ``count_part`` is called for each part of the form, and raises if they are too many.
     Raises ``IrregularError``: they may have other sizes, or it is of another class.
     """
-    write, read = _form_of(value)
+    write, read = _form_of(value, count_part)
 
     def write_some(members: Sequence[Any], written: Written) -> None:
         written.numbers += [member is not None for member in members]
@@ -211,7 +212,8 @@ def members_like(value: Any) -> tuple[Write, Read]:
     return write_some, read_some
 
 
-def _form_of(value: Any) -> tuple[Write, Read]:
+def _form_of(value: Any, count_part: Callable[[], None]) -> tuple[Write, Read]:
+    count_part()
     if type(value) is np.ndarray and value.ndim:
         return _rows(value.shape)
     if type(value) is int or isinstance(value, np.integer):
@@ -219,7 +221,8 @@ def _form_of(value: Any) -> tuple[Write, Read]:
     if type(value) is str:
         return _write_texts, _read_texts
     if type(value) is dict and _classes([*value]) == {str}:
-        return _fields(list(map(_form_of, value.values())), {dict}, keys=list(value))
+        parts = [_form_of(part, count_part) for part in value.values()]
+        return _fields(parts, {dict}, keys=list(value))
     raise IrregularError
 
 
