@@ -17,11 +17,12 @@ import pytest
 from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import RemoteEnvError, WorkerError
+from envhub_sandbox.errors import RemoteEnvError, WorkerDiedError, WorkerError
 from envhub_sandbox.sandboxes.pool import stop_idle
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.system.folders import cache_root
+from envhub_sandbox.transport.deadline import Deadline
 from tests.support import inside
 from tests.support.processes import descendants, eventually
 from tests.support.repositories import STILL, write_repository
@@ -275,7 +276,15 @@ def test_what_dies_unused_is_started_again(tasks: Callable[..., Tasks]) -> None:
     for pid in jail:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-    assert eventually(lambda: descendants() <= server)  # others' may end meanwhile
+    [lease] = inside.leases(envs[1])
+
+    def is_known() -> bool:
+        with contextlib.suppress(WorkerDiedError):
+            lease.look("reset", Deadline(60))
+            return False
+        return True
+
+    assert eventually(is_known)  # a process may end a moment before the server hears of it
     assert envs[1].reset()[0][0][0] == 1.0
 
 
