@@ -10,7 +10,8 @@ from envhub_worker.extras.denials.paths import OwnPaths, asked
 from envhub_worker.extras.denials.targets import OTHER, is_another_target
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.root_plan import TERMINALS
-from envhub_worker.lockdown.seccomp.notify import SIGNALS, Request
+from envhub_worker.lockdown.seccomp.notify import Request
+from envhub_worker.lockdown.seccomp.policy import BROKERED
 from envhub_worker.lockdown.seccomp.syscalls import NAMED, NAMING, PRETENDED
 from envhub_worker.lockdown.stages.runner import writable_folders
 
@@ -40,7 +41,7 @@ class Recorder:
                 self._report_once(*attempt)
             return
         detail = _detail(request)
-        own_affair = call in watched or call in PRETENDED or call in SIGNALS
+        own_affair = call in watched or call in PRETENDED or call in BROKERED
         if detail or not own_affair:  # else it targets the jail's own processes
             self._report_once(call, detail)
 

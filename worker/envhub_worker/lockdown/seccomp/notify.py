@@ -23,7 +23,7 @@ from collections.abc import Callable, Collection
 from functools import partial
 
 from envhub_worker.lockdown.mechanisms import kernel, procfs
-from envhub_worker.lockdown.seccomp.policy import WITHOUT_ATTRIBUTES, refusal
+from envhub_worker.lockdown.seccomp.policy import BROKERED, WITHOUT_ATTRIBUTES, refusal
 from envhub_worker.lockdown.seccomp.syscalls import c_int, syscall_name
 from envhub_worker.protocol.records import dataclass
 
@@ -66,15 +66,14 @@ _PROCEED = -1
 """In the place of an errno: the kernel makes the call itself. Not None, which is what a path would
 answer that forgets to."""
 _Inside = Callable[[], Collection[int]]
-SIGNALS = ("kill", "tkill", "tgkill", "setpgid")
 
 
 def serve(listener: int, permitted: Collection[str], note: Callable[[Request], None]) -> bool:
     """Answer one request that waits at ``listener``; returns False if no caller is left.
 
     The kernel continues the calls of ``permitted``, which the policy allows with any arguments and
-    which init only records. All other calls except signals are denied, and so are calls that set
-    attributes.
+    which init only records. All other calls except ``BROKERED`` are denied, and so are calls that
+    set attributes.
     """
     buffer = bytearray(_REQUEST.size)
     try:
@@ -92,7 +91,7 @@ def serve(listener: int, permitted: Collection[str], note: Callable[[Request], N
     note(request)  # before the caller goes on: what it did is known when it is looked for
     if call in permitted and call not in WITHOUT_ATTRIBUTES:
         answer = _PROCEED
-    elif call in SIGNALS:
+    elif call in BROKERED:
         answer = decide(request, partial(procfs.descendants, os.getpid()))
     else:
         answer = refusal(call)
@@ -110,7 +109,8 @@ def _has_callers(listener: int) -> bool:
 
 
 def decide(request: Request, inside: _Inside) -> int:
-    """Send the signal of a request if it is permitted. Returns 0, an errno, or ``_PROCEED``.
+    """Decide on a call of ``BROKERED``, and send its signal if it is permitted. Returns 0, an
+    errno, or ``_PROCEED``.
     ``inside``: returns the pids of the jail's processes, without init.
     """
     first, second, third = request.arguments

@@ -135,6 +135,8 @@ _PRCTLS = (1, 2, 3, 15, 16, 21, 23, 27, 29, 30, 36, 37, 38, 39, 42, 51, 52, 56, 
 _PR_DENIED = (4, 8, 22, 24, 28, 35, 47, 59)
 # arch_prctl: segment bases, which new threads need, and matrix registers (AMX), which torch uses.
 _ARCH_PRCTLS = (0x1001, 0x1002, 0x1003, 0x1004, 0x1021, 0x1022, 0x1023)
+BROKERED = ("kill", "tkill", "tgkill", "setpgid")
+"""Calls that could reach init, where nothing else keeps the jail's signals inside."""
 
 
 def policy_table(
@@ -150,7 +152,7 @@ def policy_table(
     Args:
         namespaced: A mount, pid and IPC namespace hold the jail, so that paths, processes and
             IPC objects of the host are out of reach anyway.
-        brokered: Init sends the jail's signals: see ``notify``.
+        brokered: Init decides on ``BROKERED``: see ``notify``.
         measured: No control group counts the jail's memory: see ``watchdog``.
         scoped: Landlock keeps the abstract sockets of the network namespace out of reach.
     """
@@ -167,7 +169,7 @@ def policy_table(
     verdicts |= dict.fromkeys(_NAMESPACED.split(), ALLOW) if namespaced else _without_namespaces()
     verdicts |= dict.fromkeys(WITHOUT_ATTRIBUTES, _ENOTSUP)
     if brokered:
-        verdicts |= dict.fromkeys(("kill", "tkill", "tgkill", "setpgid"), ASK)
+        verdicts |= dict.fromkeys(BROKERED, ASK)
         verdicts["pidfd_send_signal"] = ENOSYS
     return verdicts
 
