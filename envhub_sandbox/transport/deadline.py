@@ -174,7 +174,8 @@ _ADVANTAGE = 0.97
 class SpinChooser:
     """Chooses between spinning and sleep. The lane calls ``measured`` once for each step.
     ``longest_ns``: the longest wait awake that it may choose.
-    ``budget_ns``: how long each side may wait awake; 0 for not at all.
+    ``budget_ns``: how long each side may wait awake, the runner up to ``MAX_SPIN_NS`` of it; 0 for
+    not at all.
     """
 
     def __init__(self, allowed: bool, longest_ns: int = _MAX_BUDGET_NS) -> None:
